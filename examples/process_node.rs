@@ -15,7 +15,8 @@
 //! an iceoryx2 binding will do. What it prints goes to the log of `rapid`.
 //!
 //! Options: `--rate HZ`, `--channels N`; and to try what happens when a program misbehaves:
-//! `--ignore-sigterm`, `--crash-after SAMPLES`, `--silent-after SAMPLES`, `--flood-stderr`.
+//! `--ignore-sigterm`, `--crash-after SAMPLES`, `--silent-after SAMPLES`, `--flood-stderr`, `--behind SECONDS` (its capture
+//! times are that old; negative: in the future).
 
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "what a program prints goes to the log of `rapid`")]
 
@@ -89,7 +90,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         values[0] = f64::from(seq);
         let payload: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
         let mut sample = publisher.loan_slice_uninit(payload.len())?;
-        *sample.user_header_mut() = Header(SampleHeader { seq: seq.into(), capture_ns: Stamp::now().0, ..header });
+        *sample.user_header_mut() =
+            Header(SampleHeader { seq: seq.into(), capture_ns: options.captured().0, ..header });
         sample.write_from_slice(&payload).send()?;
         wake.notify()?;
         let due = begun + Duration::from_secs_f64(f64::from(seq + 1) / options.rate);
@@ -109,6 +111,7 @@ struct Options {
     crash_after: Option<u32>,
     silent_after: Option<u32>,
     flood_stderr: bool,
+    behind: f64,
 }
 
 impl Options {
@@ -120,12 +123,14 @@ impl Options {
             crash_after: None,
             silent_after: None,
             flood_stderr: false,
+            behind: 0.0,
         };
         let mut arguments = std::env::args().skip(1);
         while let Some(option) = arguments.next() {
             match option.as_str() {
                 "--rate" => options.rate = value(&option, arguments.next())?,
                 "--channels" => options.channels = value(&option, arguments.next())?,
+                "--behind" => options.behind = value(&option, arguments.next())?,
                 "--ignore-sigterm" => options.ignore_sigterm = true,
                 "--crash-after" => options.crash_after = Some(value(&option, arguments.next())?),
                 "--silent-after" => options.silent_after = Some(value(&option, arguments.next())?),
@@ -134,6 +139,11 @@ impl Options {
             }
         }
         Ok(options)
+    }
+
+    fn captured(&self) -> Stamp {
+        let distance = Duration::from_secs_f64(self.behind.abs());
+        if self.behind < 0.0 { Stamp::now().after(distance) } else { Stamp::now().before(distance) }
     }
 }
 

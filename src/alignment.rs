@@ -18,6 +18,8 @@ use rapid_core::observation::{HEAD_BYTES, SLOT_BYTES};
 use rapid_core::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
 use rapid_core::sync::{Grid, SyncModality, SyncSample, Synchronizer};
 use rapid_core::time::Stamp;
+use rapid_core::walked::WalkedPictures;
+use rapid_pictures::judge::PictureJudge;
 use rapid_registry::{DeviceSpec, Registry};
 use rapid_status::Board;
 use tokio::sync::mpsc;
@@ -46,7 +48,7 @@ pub struct Alignment {
 impl Alignment {
     /// Of the samples that reach `queues` from now on; `writer` is that of the topic of observations.
     pub fn new(registry: &Registry, queues: Queues, writer: Arc<Writer>, board: Arc<Board>) -> Self {
-        let (aligner, hz) = (Aligner::new(registry), registry.rig.observation_hz);
+        let (aligner, hz) = (Aligner::new(registry, board.walked()), registry.rig.observation_hz);
         Self { aligner, hz, queues, writer, board, additions: mpsc::unbounded_channel().1 }
     }
 
@@ -118,16 +120,18 @@ fn modality(device: &DeviceSpec) -> SyncModality {
 #[derive(Debug)]
 struct Aligner {
     sync: Synchronizer<()>,
+    judge: PictureJudge,
     /// Changes of the mask and when they were published, the oldest first.
     masks: VecDeque<(Stamp, Bits)>,
     payload: Vec<u8>,
 }
 
 impl Aligner {
-    fn new(registry: &Registry) -> Self {
+    fn new(registry: &Registry, walked: Arc<WalkedPictures>) -> Self {
         let modalities: Vec<_> = registry.devices.iter().map(modality).collect();
         Self {
             sync: Synchronizer::new(&modalities, registry.rig.sync_window),
+            judge: PictureJudge::sharing(walked),
             masks: VecDeque::with_capacity(MASKS),
             payload: Vec::with_capacity(HEAD_BYTES + modalities.len() * SLOT_BYTES),
         }
@@ -139,7 +143,7 @@ impl Aligner {
 
     fn receive(&mut self, topic: TopicId, header: &SampleHeader, payload: &[u8]) {
         match topic {
-            TopicId::Modality(id) => self.sample(id, header),
+            TopicId::Modality(id) => self.sample(id, header, payload),
             TopicId::Mask => {
                 if let Some((bits, _)) = Bits::of_payload(payload) {
                     self.mask(Stamp(header.capture_ns), bits);
@@ -150,8 +154,9 @@ impl Aligner {
     }
 
     /// A damaged sample belongs to no observation.
-    fn sample(&mut self, id: ModalityId, header: &SampleHeader) {
-        if header.flags & FLAG_ERROR == 0 {
+    fn sample(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8]) {
+        let is_usable = self.judge.sample(id, header, payload).is_usable();
+        if header.flags & FLAG_ERROR == 0 && is_usable {
             let (capture, recv, epoch) = (Stamp(header.capture_ns), Stamp(header.recv_ns), Epoch(header.epoch));
             self.sync.push(id, SyncSample { capture, recv, seq: header.seq, epoch, keep: () });
         }
@@ -204,7 +209,7 @@ mod tests {
     #[test]
     fn an_observation_names_what_was_known_at_its_tick() {
         let registry = Registry::parse(REGISTRY, None).expect("a registry").registry;
-        let mut aligner = Aligner::new(&registry);
+        let mut aligner = Aligner::new(&registry, Arc::default());
         let [cam, tof] = [0, 1].map(|index| registry.devices[index].id);
         let sample = |seq: u64, captured: u64, received: u64, flags: u32| SampleHeader {
             seq,
@@ -238,7 +243,7 @@ mod tests {
     #[test]
     fn an_added_modality_is_in_the_next_observation() {
         let registry = Registry::parse(REGISTRY, None).expect("a registry").registry;
-        let mut aligner = Aligner::new(&registry);
+        let mut aligner = Aligner::new(&registry, Arc::default());
         aligner.receive(TopicId::Mask, &SampleHeader::default(), &Bits::from(PhysicalMask(0b110)).payload(1));
         assert_eq!(read(aligner.observe(Stamp(50 * MS))).1.len(), 2);
         let text = REGISTRY.replace("tof", "new").replace("bit = 3", "bit = 2");
@@ -254,7 +259,7 @@ mod tests {
     #[test]
     fn more_changes_of_the_mask_than_are_remembered_leave_the_newest() {
         let registry = Registry::parse(REGISTRY, None).expect("a registry").registry;
-        let mut aligner = Aligner::new(&registry);
+        let mut aligner = Aligner::new(&registry, Arc::default());
         for at in 0..1000 {
             aligner.mask(Stamp(at), PhysicalMask(at % 2).into());
         }

@@ -104,14 +104,9 @@ impl<'a> Filter<'a> {
             return true;
         }
         let args = self.args;
-        let label = match row.notes.label {
-            Some(Label::Success) => LabelFilter::Success,
-            Some(Label::Failure) => LabelFilter::Failure,
-            None => LabelFilter::None,
-        };
         let has = |name: &String| recorded.contains(name);
         (args.verdict.is_empty() || args.verdict.iter().any(|wanted| Some(wanted.grade()) == verdict.grade()))
-            && (args.label.is_empty() || args.label.contains(&label))
+            && (args.label.is_empty() || args.label.contains(&LabelFilter::of(row.notes.label)))
             && self.task.as_ref().is_none_or(|part| task.to_lowercase().contains(part))
             && args.tag.iter().all(|(key, value)| tags.get(key) == Some(value))
             && args.sensor.iter().all(has)

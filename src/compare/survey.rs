@@ -7,7 +7,7 @@ use std::path::Path;
 use rapid_core::action::ACTION_TOPIC;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
-use rapid_core::sample::{Encoding, Epoch, SampleHeader};
+use rapid_core::sample::{Encoding, Epoch, SampleHeader, damage};
 use rapid_episode::ReadError;
 use rapid_episode::decode::{Content, Sample, Scratch};
 use rapid_episode::encode::EventText;
@@ -252,6 +252,7 @@ pub(super) fn header(message: &Message<'_>, sample: &Sample<'_>) -> SampleHeader
         encoding: sample.encoding as u32,
         width: sample.width,
         height: sample.height,
+        flags: damage(sample.encoding, sample.payload),
         ..SampleHeader::default()
     }
 }

@@ -23,4 +23,5 @@ pub mod sync;
 pub mod text;
 pub mod time;
 pub mod topic;
+pub mod walked;
 mod words;

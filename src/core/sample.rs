@@ -70,10 +70,24 @@ impl Encoding {
     }
 }
 
-/// Header flag: the device or driver reported that this payload is damaged.
+/// Header flag: this payload is damaged, as its device or driver reported or by its content ([`damage`]).
 pub const FLAG_ERROR: u32 = 1;
 /// Header flag: the capture time comes from the kernel or the device, not from the moment of arrival.
 pub const FLAG_DEVICE_TIME: u32 = 2;
+
+/// Whether the numbers of an [`Encoding::F64`] payload can be used: there is one at least, and each is finite, also in the
+/// 32 bits that a policy and a dataset have for it. Any other sample of numbers is damaged, whoever sent it.
+pub fn are_usable_numbers(payload: &[u8]) -> bool {
+    let (numbers, rest) = payload.as_chunks();
+    #[expect(clippy::cast_possible_truncation, reason = "what is too large for 32 bits becomes infinite")]
+    let is_finite = |number: &[u8; 8]| (f64::from_le_bytes(*number) as f32).is_finite();
+    !numbers.is_empty() && rest.is_empty() && numbers.iter().all(is_finite)
+}
+
+/// [`FLAG_ERROR`] if what a payload holds shows that it is damaged, else no flag.
+pub fn damage(encoding: Encoding, payload: &[u8]) -> u32 {
+    if encoding == Encoding::F64 && !are_usable_numbers(payload) { FLAG_ERROR } else { 0 }
+}
 
 /// Accompanies every payload, as iceoryx2 user header. 56 bytes, native alignment 8.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -113,6 +127,26 @@ mod tests {
         assert_eq!(std::mem::size_of::<SampleHeader>(), 56);
         assert_eq!(std::mem::offset_of!(SampleHeader, id), 32);
         assert_eq!(std::mem::offset_of!(SampleHeader, height), 52);
+    }
+
+    #[test]
+    fn numbers_that_are_not_finite_are_damaged() {
+        let bytes = |numbers: &[f64]| numbers.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>();
+        for fine in [&[0.0][..], &[1.5, -2.0, 1e-300], &[f64::from(f32::MAX), f64::from(f32::MIN), -0.0]] {
+            assert_eq!(damage(Encoding::F64, &bytes(fine)), 0, "{fine:?}");
+        }
+        for bad in [f64::NAN, -f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e39, f64::MIN] {
+            for numbers in [&[bad][..], &[bad, 0.0, 0.0], &[0.0, bad, 0.0], &[0.0, 0.0, bad]] {
+                assert_eq!(damage(Encoding::F64, &bytes(numbers)), FLAG_ERROR, "{numbers:?}");
+                // Bytes mean nothing by themselves, and pixels are any.
+                for other in [Encoding::Bytes, Encoding::Grey, Encoding::Depth] {
+                    assert_eq!(damage(other, &bytes(numbers)), 0, "{numbers:?} as {other:?}");
+                }
+            }
+        }
+        for none in [&[][..], &[0; 7], &[0; 9]] {
+            assert_eq!(damage(Encoding::F64, none), FLAG_ERROR, "{none:?}");
+        }
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! The values of a row in a dataset.
 //!
 //! Invariant: of a modality that is not there, or whose sample cannot be used, pictures are black and numbers zero, and it
-//! is not valid. A picture in JPEG is copied byte for byte.
+//! is not valid. A picture in JPEG is copied as `picture` says.
 
 use std::borrow::Cow;
 use std::rc::Rc;

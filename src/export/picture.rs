@@ -1,4 +1,5 @@
-//! Pictures of a dataset: a JPEG as the camera sent it, and what is not compressed as PNG, which loses nothing.
+//! Pictures of a dataset: a JPEG as the camera sent it, without what readers interpret differently, and what is not
+//! compressed as PNG, which loses nothing.
 //!
 //! Grey is written as three equal channels. YUYV becomes red, green and blue first, by the rule of `pixels`: LeRobot
 //! and its policies know no other pictures.
@@ -8,7 +9,7 @@ use std::fmt;
 
 use rapid_core::sample::Encoding;
 use rapid_episode::decode::jpeg_frame;
-use rapid_episode::record::is_whole_jpeg;
+use rapid_pictures::jpeg::{Walker, plain};
 use rapid_pictures::pixels::{LARGEST, Picture, PixelError, Pixels};
 
 use super::rows::Payload;
@@ -72,7 +73,7 @@ impl Codec {
 }
 
 /// Pixels along each side, and values of a pixel: 3, and 1 in the pictures of a camera that sends grey JPEGs.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Shape {
     /// Rows.
     pub height: u32,
@@ -97,18 +98,23 @@ impl fmt::Display for Shape {
     }
 }
 
-/// The shape of a picture that can be used: of a JPEG, one with its beginning, its end and a size.
-pub(super) fn shape(payload: &Payload) -> Option<Shape> {
-    let Payload::Picture { encoding, width, height, bytes } = payload else { return None };
-    let (width, height) = (*width, *height);
+/// The shape that a picture states of itself, whether it can be used or not.
+pub(super) fn stated(encoding: Encoding, width: u32, height: u32, bytes: &[u8]) -> Option<Shape> {
     let pixels = usize::try_from(u64::from(width) * u64::from(height)).ok()?;
     let channels = match encoding {
-        Encoding::Mjpeg => jpeg_frame(bytes).map(|(_, _, components)| components).filter(|_| is_whole_jpeg(bytes)),
+        Encoding::Mjpeg => jpeg_frame(bytes).map(|(_, _, components)| components),
         Encoding::Grey => (bytes.len() == pixels).then_some(3),
         Encoding::Yuyv => (Some(bytes.len()) == pixels.checked_mul(2) && pixels.is_multiple_of(2)).then_some(3),
         Encoding::Bytes | Encoding::F64 | Encoding::Mask | Encoding::Depth => None,
     };
     Shape::new(height, width, channels?)
+}
+
+/// The shape of a picture that can be used: of a JPEG, one that is whole.
+pub(super) fn shape(payload: &Payload) -> Option<Shape> {
+    let Payload::Picture { encoding, width, height, bytes } = payload else { return None };
+    let is_whole = *encoding != Encoding::Mjpeg || Walker::default().walk(bytes).is_ok();
+    stated(*encoding, *width, *height, bytes).filter(|_| is_whole)
 }
 
 /// The file of a picture.
@@ -117,7 +123,7 @@ pub(super) fn shape(payload: &Payload) -> Option<Shape> {
 /// When it has no pixels.
 pub(super) fn file<'a>(payload: &'a Payload, pixels: &mut Pixels) -> Result<Cow<'a, [u8]>, PixelError> {
     match payload {
-        Payload::Picture { encoding: Encoding::Mjpeg, bytes, .. } => Ok(Cow::Borrowed(bytes)),
+        Payload::Picture { encoding: Encoding::Mjpeg, bytes, .. } => Ok(plain(bytes)),
         Payload::Picture { encoding, width, height, bytes } => {
             let (encoding, width, height) = (*encoding, *width, *height);
             pixels.decode(&Picture { encoding, width, height, bytes })?;

@@ -4,9 +4,14 @@
 //! until the last row that needs it.
 //!
 //! Invariant: a row shows a modality only if its bit is set at the tick, the frame names a sample and the file has it.
+//! Invariant: all samples that rows show of a modality have one form, that of most of its samples. One sample that is
+//! otherwise decides about its own row, and not about the episode.
 
-use std::collections::BTreeMap;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
 use std::io;
+use std::ops::Range;
 use std::path::Path;
 use std::rc::Rc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -14,14 +19,20 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rapid_core::action::ACTION_TOPIC;
 use rapid_core::modality::{ModalityId, ModalityKind};
 use rapid_core::sample::Encoding;
+use rapid_core::text;
 use rapid_core::topic::FRAME_TOPIC;
 use rapid_episode::decode::{Content, FrameSlot, Kind, Sample, Scratch};
-use rapid_episode::reader::{Item, Message, Reader};
+use rapid_episode::reader::{Channel, Item, Reader};
 use rapid_episode::{ABOUT, ReadError};
 use rapid_registry::columns::ColumnError;
+use rapid_status::Grade;
+
+use super::picture::{self, Shape};
 
 /// Bytes of samples that may wait for their frame: a minute of four cameras, where a second is usual.
 const MOST_WAITING: usize = 1 << 30;
+/// Numbers that a registry may declare of a sample; what a file claims may be anything.
+pub(super) const LONGEST: usize = 1 << 16;
 /// No registry is longer; the text of a hostile file may be.
 const LONGEST_REGISTRY: usize = 1 << 20;
 
@@ -46,6 +57,9 @@ pub enum Refusal {
     /// Its verdict.
     #[error("BAD ({0}); --include-bad exports it nevertheless")]
     Bad(String),
+    /// Its verdict is not one that was selected.
+    #[error("{}", .0.word())]
+    NotSelected(Grade),
     /// A value of its metadata.
     #[error("metadata record `{ABOUT}`, key `{key}`: {problem}")]
     Metadata {
@@ -73,18 +87,6 @@ pub enum Refusal {
     /// Neither a camera nor a vector.
     #[error("neither a camera nor a numeric sensor")]
     Nothing,
-    /// The pictures of a camera have several sizes.
-    #[error("{name}: a picture of {found} in frame {frame}, and {expected} before")]
-    Size {
-        /// The camera.
-        name: String,
-        /// The row.
-        frame: usize,
-        /// Its size.
-        found: String,
-        /// That of the first one.
-        expected: String,
-    },
     /// A picture that no video can have.
     #[error("{name}: pictures of {shape}, and a video takes even numbers of pixels: --pictures jpeg has no such limit")]
     OddSize {
@@ -96,19 +98,6 @@ pub enum Refusal {
     /// A sensor without any sample, here or in the set.
     #[error("{0}: no usable sample to take the size from, and neither the other episodes nor the registry give it")]
     NoSize(String),
-    /// Numbers of several lengths.
-    #[error("{name}: {found} values, and {expected} before")]
-    Length {
-        /// The modality, or the topic of actions.
-        name: String,
-        /// How many.
-        found: usize,
-        /// How many there were before.
-        expected: usize,
-    },
-    /// An action that is not a number.
-    #[error("{ACTION_TOPIC}: a number that is not finite in message {0}")]
-    NotFinite(u32),
     /// It does not match the other episodes of the set.
     #[error("{0}")]
     Different(String),
@@ -152,6 +141,84 @@ pub(super) struct Listed {
     pub(super) shape: Vec<u32>,
     #[serde(default)]
     latency_ns: u64,
+}
+
+impl Listed {
+    /// The form of its samples by the registry.
+    pub(super) fn declared(&self) -> Option<Form> {
+        match (self.kind, self.shape.as_slice()) {
+            (ModalityKind::Image, [height, width]) => Shape::new(*height, *width, 3).map(Form::Picture),
+            (ModalityKind::Scalars, [length, ..]) => Form::of_numbers(usize::try_from(*length).ok()?),
+            _ => None,
+        }
+    }
+}
+
+/// What the samples of a modality must have in common to be a feature of a dataset.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Form {
+    Picture(Shape),
+    /// How many.
+    Numbers(usize),
+}
+
+impl Form {
+    fn of_numbers(length: usize) -> Option<Self> {
+        (1..=LONGEST).contains(&length).then_some(Self::Numbers(length))
+    }
+
+    /// Of a sample, as it states it of itself: whether a picture can be used shows later.
+    fn of_sample(sample: &Sample<'_>) -> Option<Self> {
+        let Sample { encoding, width, height, payload } = *sample;
+        match encoding {
+            Encoding::F64 => Self::of_numbers(payload.len() / size_of::<f64>()),
+            encoding => picture::stated(encoding, width, height, payload).map(Self::Picture),
+        }
+    }
+
+    const fn is_of(self, kind: ModalityKind) -> bool {
+        matches!((self, kind), (Self::Picture(_), ModalityKind::Image) | (Self::Numbers(_), ModalityKind::Scalars))
+    }
+
+    /// The one that occurs most often; of those the declared one, else the first.
+    pub(super) fn most_frequent(forms: impl Iterator<Item = Self>, declared: Option<Self>) -> Option<Self> {
+        // By form: how often, and where first.
+        let mut counts: BTreeMap<Self, (usize, usize)> = BTreeMap::new();
+        for (at, form) in forms.enumerate() {
+            counts.entry(form).or_insert((0, at)).0 += 1;
+        }
+        let rank = |(form, (count, first)): &(Self, (usize, usize))| (*count, declared == Some(*form), Reverse(*first));
+        counts.into_iter().max_by_key(rank).map(|(form, _)| form)
+    }
+}
+
+impl fmt::Display for Form {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Picture(shape) => write!(f, "a picture of {shape}"),
+            Self::Numbers(1) => f.write_str("1 number"),
+            Self::Numbers(length) => write!(f, "{length} numbers"),
+        }
+    }
+}
+
+/// Samples of a sensor, or messages of the topic of actions, that no row shows.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+pub struct Unfit {
+    /// The sensor, or the topic.
+    pub name: String,
+    /// How many rows of the sensor, or messages of the topic.
+    pub count: usize,
+    /// What is wrong with them.
+    pub reason: String,
+}
+
+impl fmt::Display for Unfit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { name, count, reason } = self;
+        let unit = if name == ACTION_TOPIC { "message" } else { "frame" };
+        write!(f, "{name}: {} ({reason})", text::counted(*count as u64, unit))
+    }
 }
 
 /// A modality at a tick.
@@ -212,6 +279,15 @@ pub(super) struct Row<'a> {
     pub(super) action: &'a [f64],
 }
 
+/// A topic with messages.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Topic {
+    pub(super) name: String,
+    /// The modality whose samples it has.
+    pub(super) bit: Option<ModalityId>,
+    pub(super) kind: Kind,
+}
+
 /// The frames of an episode.
 #[derive(Debug)]
 pub(super) struct Index {
@@ -223,7 +299,13 @@ pub(super) struct Index {
     pub(super) ticks: Vec<u64>,
     /// Of each row, one for each modality.
     slots: Vec<Slot>,
+    /// By modality: the form of the samples that rows show; `None` if none has a form.
+    forms: Vec<Option<Form>>,
+    /// What has another form, and actions that cannot be used.
+    pub(super) unfit: Vec<Unfit>,
     actions: Actions,
+    /// Ascending by name.
+    pub(super) topics: Vec<Topic>,
     /// The text of the registry that it was recorded with; empty if it carries none.
     pub(super) registry: String,
     /// The names of the axes of an action, as its channel lists them; empty if it does not.
@@ -239,23 +321,55 @@ struct Actions {
     length: usize,
 }
 
-impl Actions {
-    fn push(&mut self, message: &Message<'_>, sample: &Sample<'_>) -> Result<(), Refusal> {
-        let values = numbers(sample.payload);
-        if self.times.is_empty() {
-            self.length = values.len();
-        } else if self.length != values.len() {
-            let (found, expected) = (values.len(), self.length);
-            return Err(Refusal::Length { name: ACTION_TOPIC.to_owned(), found, expected });
-        }
-        if values.iter().any(|value| !value.is_finite()) {
-            return Err(Refusal::NotFinite(message.sequence));
-        }
-        self.times.push(message.log_time);
-        self.values.extend(values);
-        Ok(())
+/// Actions as they are in the file: their time, and where their numbers are.
+#[derive(Debug, Default)]
+struct Sent {
+    all: Vec<(u64, Range<usize>)>,
+    values: Vec<f64>,
+}
+
+impl Sent {
+    fn push(&mut self, time: u64, sample: &Sample<'_>) {
+        let begin = self.values.len();
+        self.values.extend(numbers(sample.payload));
+        self.all.push((time, begin..self.values.len()));
     }
 
+    /// Those that can be used, sorted: of the usual length and finite. Any other moves no motor either; the one before it
+    /// stays in force.
+    fn usable(self) -> (Actions, Vec<Unfit>) {
+        let Self { all, values } = self;
+        let of = |range: &Range<usize>| values.get(range.clone()).unwrap_or_default();
+        let is_finite = |range: &Range<usize>| of(range).iter().all(|value| value.is_finite());
+        let finite = || all.iter().filter(|(_, range)| is_finite(range));
+        let form = Form::most_frequent(finite().filter_map(|(_, range)| Form::of_numbers(range.len())), None);
+        let Some(Form::Numbers(length)) = form else {
+            return (Actions::default(), Unfit::of_actions(all.len(), "no finite number".to_owned()));
+        };
+        let mut actions = Actions { length, ..Actions::default() };
+        for (time, range) in finite().filter(|(_, range)| range.len() == length) {
+            actions.times.push(*time);
+            actions.values.extend(of(range));
+        }
+        actions.sort();
+        let is_other = |(_, range): &&(u64, Range<usize>)| range.len() != length;
+        let reason = match all.iter().find(is_other) {
+            Some((_, range)) => format!("{} numbers, and not {length}", range.len()),
+            None => "a number that is not finite".to_owned(),
+        };
+        let unfit = Unfit::of_actions(all.len() - actions.times.len(), reason);
+        (actions, unfit)
+    }
+}
+
+impl Unfit {
+    fn of_actions(count: usize, reason: String) -> Vec<Self> {
+        let unfit = || Self { name: ACTION_TOPIC.to_owned(), count, reason };
+        (count > 0).then(unfit).into_iter().collect()
+    }
+}
+
+impl Actions {
     /// The action of a tick: the one nearest to it within half a period, as the training of this project chooses them;
     /// without one the last before it, which is still in force, and before all of them the first.
     fn at(&self, tick: u64, period_ns: u64) -> &[f64] {
@@ -297,11 +411,14 @@ impl Index {
         let mut reader = Reader::open(path)?;
         let mut scratch = Scratch::default();
         let mut frames = Vec::new();
-        let mut actions = Actions::default();
-        // By modality, in the order of the file: number and capture time.
+        let mut sent = Sent::default();
+        // By modality, in the order of the file: number and capture time; and the form.
         let mut samples: BTreeMap<ModalityId, Vec<(u32, u64)>> = BTreeMap::new();
+        let mut stated: BTreeMap<ModalityId, Vec<Option<Form>>> = BTreeMap::new();
+        let mut has_messages = BTreeSet::new();
         while reader.advance()? {
             let Item::Message(message) = reader.item() else { continue };
+            has_messages.insert(message.channel.id);
             match message.channel.kind {
                 Kind::Frame => {
                     check(stop)?;
@@ -314,16 +431,22 @@ impl Index {
                     let Some(Content::Sample(sample)) = message.content(&mut scratch) else { continue };
                     if let Some(id) = message.channel.bit {
                         samples.entry(id).or_default().push((message.sequence, message.log_time));
+                        stated.entry(id).or_default().push(Form::of_sample(&sample));
                     } else if message.channel.topic == ACTION_TOPIC && sample.encoding == Encoding::F64 {
-                        actions.push(&message, &sample)?;
+                        sent.push(message.log_time, &sample);
                     }
                 }
                 Kind::Mask | Kind::Event | Kind::Other => {}
             }
         }
-        actions.sort();
+        let (actions, mut unfit) = sent.usable();
         let of_actions = reader.channels().find(|channel| channel.topic == ACTION_TOPIC);
         let action_names = of_actions.and_then(|channel| serde_json::from_str(channel.names.as_deref()?).ok());
+        let topic = |channel: &Channel| Topic { name: channel.topic.clone(), bit: channel.bit, kind: channel.kind };
+        let mut topics: Vec<Topic> =
+            reader.channels().filter(|channel| has_messages.contains(&channel.id)).map(topic).collect();
+        topics.sort_by(|a, b| a.name.cmp(&b.name));
+        topics.dedup_by(|a, b| a.name == b.name);
         let registry = reader.about("registry").filter(|text| text.len() <= LONGEST_REGISTRY);
         let registry = registry.unwrap_or_default().to_owned();
         let modalities = modalities(reader.about("modalities"))?;
@@ -332,13 +455,17 @@ impl Index {
         check_ticks(&frames)?;
         let slots = chosen(&modalities, &frames, &samples);
         let ticks = frames.iter().map(|frame| frame.time_ns).collect();
+        let forms = forms(&modalities, &slots, &stated, &mut unfit);
         Ok(Self {
             fps,
             task,
             modalities,
             ticks,
             slots,
+            forms,
+            unfit,
             actions,
+            topics,
             registry,
             action_names: action_names.unwrap_or_default(),
         })
@@ -463,6 +590,29 @@ fn chosen(modalities: &[Listed], frames: &[Frame], samples: &BTreeMap<ModalityId
         .collect()
 }
 
+/// By modality, the form that most of the samples have that rows show; rows whose sample has another are added to `unfit`.
+fn forms(
+    modalities: &[Listed],
+    slots: &[Slot],
+    stated: &BTreeMap<ModalityId, Vec<Option<Form>>>,
+    unfit: &mut Vec<Unfit>,
+) -> Vec<Option<Form>> {
+    let form_of = |(at, modality): (usize, &Listed)| {
+        let stated = stated.get(&modality.bit).map(Vec::as_slice).unwrap_or_default();
+        let samples = slots.iter().skip(at).step_by(modalities.len()).filter_map(|slot| slot.sample);
+        let form = |sample: u32| stated.get(usize::try_from(sample).ok()?).copied().flatten();
+        let all = || samples.clone().filter_map(form).filter(|form| form.is_of(modality.kind));
+        let expected = Form::most_frequent(all(), modality.declared())?;
+        let mut others = all().filter(|form| *form != expected).peekable();
+        if let Some(other) = others.peek().copied() {
+            let reason = format!("{other}, and not {expected}");
+            unfit.push(Unfit { name: modality.name.clone(), count: others.count(), reason });
+        }
+        Some(expected)
+    };
+    modalities.iter().enumerate().map(form_of).collect()
+}
+
 /// Samples that were read and whose row is still to come.
 struct Waiting<'a> {
     index: &'a Index,
@@ -502,7 +652,9 @@ impl<'a> Waiting<'a> {
         if !uses.contains_key(&place) {
             return Ok(false);
         }
-        let payload = Payload::from_sample(sample).unwrap_or(Payload::Numbers(Vec::new()));
+        let expected = self.index.forms.get(at).copied().flatten();
+        let is_fit = expected.is_none() || Form::of_sample(sample) == expected;
+        let payload = Payload::from_sample(sample).filter(|_| is_fit).unwrap_or(Payload::Numbers(Vec::new()));
         self.bytes += payload.size();
         samples.insert(place, Rc::new(payload));
         if self.bytes > MOST_WAITING { Err(Refusal::Order) } else { Ok(true) }

@@ -4,24 +4,34 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use rapid_core::modality::ModalityKind;
+use rapid_core::modality::{ModalityId, ModalityKind};
 use rapid_core::text;
 use rapid_episode::record::inspect::{self, Inspection, Judgement};
 use rapid_episode::record_iter::FileEnd;
 use rapid_pictures::pixels::{CHANNELS, Picture, Pixels};
 use rapid_registry::{ExportSpec, Form, Registry};
+use rapid_status::session::Notes;
 use rapid_status::{Grade, Verdict};
 
 use super::picture::{self, Shape};
-use super::rows::{Index, Listed, Payload, Refusal, Row};
+use super::rows::{Form as SampleForm, Index, Listed, Payload, Refusal, Row, Topic, Unfit};
 use super::statistics::Column;
 
-/// Numbers that a registry may declare of a sample; what a file claims may be anything.
-pub(super) const LONGEST: usize = 1 << 16;
 /// Of a picture with more pixels along a side, every n-th of each row and column counts for the statistics, so that
 /// about 150 are left, as in `lerobot.datasets.compute_stats.auto_downsample_height_width`.
 const WIDE: u32 = 300;
 const ABOUT_LEFT: u32 = 150;
+
+/// Which verdicts an episode may have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdicts<'a> {
+    /// GOOD and SUSPECT.
+    Fit,
+    /// Every one.
+    All,
+    /// These.
+    Only(&'a [Grade]),
+}
 
 /// An episode that can be exported.
 #[derive(Debug)]
@@ -34,11 +44,15 @@ pub struct Survey {
     pub sha256: String,
     /// The verdict on it.
     pub grade: Grade,
+    /// What people noted about it; nothing until it is set.
+    pub noted: Notes,
     /// Rows it becomes.
     pub rows: usize,
     /// Samples that belong to a row and cannot be used: damaged pictures, numbers that are not finite. Their rows are
     /// black or zero, and not valid.
     pub unusable: u64,
+    /// The same by sensor, with the reason; and actions that no row has.
+    pub unfit: Vec<Unfit>,
     pub(super) fps: u32,
     pub(super) task: String,
     /// Ascending by bit.
@@ -54,6 +68,10 @@ pub struct Survey {
     pub(super) time_ns: Column,
     /// By modality.
     pub(super) kinds: Vec<ModalityKind>,
+    /// By modality.
+    pub(super) bits: Vec<ModalityId>,
+    /// Those with messages.
+    pub(super) topics: Vec<Topic>,
 }
 
 /// What a modality has in all rows of an episode.
@@ -82,20 +100,25 @@ pub(super) enum Content {
     Bytes,
 }
 
-/// Looks at the episode at `path`; `sha256` is that of the file. One that is BAD is refused unless `include_bad`.
+/// Looks at the episode at `path`; `sha256` is that of the file. One with another verdict than `verdicts` is refused.
 ///
 /// # Errors
 /// When it cannot be exported, whatever the dataset; also when `stop` is set.
-pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool) -> Result<Survey, Refusal> {
+pub fn survey(path: &Path, sha256: String, verdicts: Verdicts<'_>, stop: &AtomicBool) -> Result<Survey, Refusal> {
     let inspection = inspect::inspect(path)?;
-    let grade = judged(&inspection, include_bad)?;
+    let grade = judged(&inspection, verdicts)?;
     let index = Index::read(path, stop)?;
     if index.modalities.iter().all(|modality| matches!(modality.kind, ModalityKind::Bytes | ModalityKind::Depth)) {
         return Err(Refusal::Nothing);
     }
     let mut found = RowCollector::new(&index);
-    index.rows(path, stop, |row| found.add(row))?;
-    let RowCollector { gatherers, time_ns: mut times, actions, unusable, .. } = found;
+    index.rows(path, stop, |row| {
+        found.add(row);
+        Ok::<_, Refusal>(())
+    })?;
+    let RowCollector { gatherers, time_ns: mut times, actions } = found;
+    let unusable = gatherers.iter().map(|gatherer| gatherer.unusable as u64).sum();
+    let unfit = unfit(&index, &gatherers);
     let rows = index.ticks.len();
     let (registry, unread_registry) = registry_of(&index.registry);
     let named = |gatherer: Gatherer| {
@@ -107,8 +130,10 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
         bytes: inspection.bytes,
         sha256,
         grade,
+        noted: Notes::default(),
         rows,
         unusable,
+        unfit,
         fps: index.fps,
         task: index.task.clone(),
         streams: gatherers.into_iter().map(named).collect(),
@@ -118,6 +143,8 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
         action: index.action_length().map(|_| columns(actions)),
         time_ns: Column::from_values(&mut times),
         kinds: index.modalities.iter().map(|modality| modality.kind).collect(),
+        bits: index.modalities.iter().map(|modality| modality.bit).collect(),
+        topics: index.topics,
     })
 }
 
@@ -134,7 +161,7 @@ fn registry_of(text: &str) -> (Option<Registry>, Option<String>) {
 }
 
 /// The verdict, of a whole file.
-fn judged(inspection: &Inspection, include_bad: bool) -> Result<Grade, Refusal> {
+fn judged(inspection: &Inspection, verdicts: Verdicts<'_>) -> Result<Grade, Refusal> {
     let Judgement::Episode(Verdict { grade, .. }) = &inspection.verdict else { return Err(Refusal::NotOurs) };
     match inspection.end {
         FileEnd::Finished => {}
@@ -147,10 +174,11 @@ fn judged(inspection: &Inspection, include_bad: bool) -> Result<Grade, Refusal> 
         let chunks = text::counted(chunks, "damaged chunk");
         return Err(Refusal::Damaged(format!("{chunks}, {} that cannot be read", text::size(bytes))));
     }
-    if *grade == Grade::Bad && !include_bad {
-        return Err(Refusal::Bad(inspection.verdict.reasons().join("; ")));
+    match verdicts {
+        Verdicts::Fit if *grade == Grade::Bad => Err(Refusal::Bad(inspection.verdict.reasons().join("; "))),
+        Verdicts::Only(grades) if !grades.contains(grade) => Err(Refusal::NotSelected(*grade)),
+        Verdicts::Fit | Verdicts::All | Verdicts::Only(_) => Ok(*grade),
     }
-    Ok(*grade)
 }
 
 /// Collects what is in the rows.
@@ -159,7 +187,6 @@ struct RowCollector {
     time_ns: Vec<f64>,
     /// By axis.
     actions: Vec<Vec<f64>>,
-    unusable: u64,
 }
 
 impl RowCollector {
@@ -167,10 +194,10 @@ impl RowCollector {
         let of = |(at, modality)| Gatherer::new(modality, pictured_rows(index, at));
         let gatherers = index.modalities.iter().enumerate().map(of).collect();
         let actions = vec![Vec::new(); index.action_length().unwrap_or_default()];
-        Self { gatherers, time_ns: Vec::new(), actions, unusable: 0 }
+        Self { gatherers, time_ns: Vec::new(), actions }
     }
 
-    fn add(&mut self, row: &Row<'_>) -> Result<(), Refusal> {
+    fn add(&mut self, row: &Row<'_>) {
         self.time_ns.push(row.time_ns as f64);
         for (axis, value) in self.actions.iter_mut().zip(row.action) {
             // In the precision of the dataset.
@@ -178,18 +205,27 @@ impl RowCollector {
         }
         for ((gatherer, slot), sample) in self.gatherers.iter_mut().zip(row.slots).zip(row.samples) {
             let is_usable = match sample {
-                Some(payload) => gatherer.add(row.number, payload, slot.valid)?,
+                Some(payload) => gatherer.add(row.number, payload, slot.valid),
                 None => false,
             };
-            self.unusable += u64::from(sample.is_some() && !is_usable);
+            gatherer.unusable += usize::from(sample.is_some() && !is_usable);
             gatherer.present += u64::from(slot.present);
             gatherer.plugged += u64::from(slot.plugged);
             if slot.valid && is_usable {
                 gatherer.ages.push(slot.age_ns as f64 / 1e9);
             }
         }
-        Ok(())
     }
+}
+
+/// What no row shows, by sensor: samples of another form, and those that are damaged.
+fn unfit(index: &Index, gatherers: &[Gatherer]) -> Vec<Unfit> {
+    let damaged = |gatherer: &Gatherer| {
+        let others = index.unfit.iter().filter(|unfit| unfit.name == gatherer.name).map(|unfit| unfit.count);
+        let count = gatherer.unusable.saturating_sub(others.sum());
+        (count > 0).then(|| Unfit { name: gatherer.name.clone(), count, reason: "damaged".to_owned() })
+    };
+    index.unfit.iter().cloned().chain(gatherers.iter().filter_map(damaged)).collect()
 }
 
 /// The nearest number of the precision that a dataset has.
@@ -232,6 +268,8 @@ struct Gatherer {
     content: Content,
     present: u64,
     plugged: u64,
+    /// Rows whose sample cannot be used.
+    unusable: usize,
     ages: Vec<f64>,
     /// By column, of the valid rows.
     numbers: Vec<Vec<f64>>,
@@ -243,20 +281,16 @@ struct Gatherer {
 
 impl Gatherer {
     fn new(modality: &Listed, pictured: Vec<usize>) -> Self {
-        let shape = modality.shape.as_slice();
-        let content = match modality.kind {
-            ModalityKind::Image => {
-                let declared = match shape {
-                    [height, width] => Shape::new(*height, *width, 3),
-                    _ => None,
-                };
-                Content::Camera { found: None, declared }
+        let content = match (modality.kind, modality.declared()) {
+            (ModalityKind::Image, Some(SampleForm::Picture(shape))) => {
+                Content::Camera { found: None, declared: Some(shape) }
             }
-            ModalityKind::Scalars => {
-                let declared = shape.first().and_then(|length| usize::try_from(*length).ok());
-                Content::Vector { found: None, declared: declared.filter(|length| (1..=LONGEST).contains(length)) }
+            (ModalityKind::Image, _) => Content::Camera { found: None, declared: None },
+            (ModalityKind::Scalars, Some(SampleForm::Numbers(length))) => {
+                Content::Vector { found: None, declared: Some(length) }
             }
-            ModalityKind::Bytes | ModalityKind::Depth => Content::Bytes,
+            (ModalityKind::Scalars, _) => Content::Vector { found: None, declared: None },
+            (ModalityKind::Bytes | ModalityKind::Depth, _) => Content::Bytes,
         };
         Self {
             name: modality.name.clone(),
@@ -264,6 +298,7 @@ impl Gatherer {
             content,
             present: 0,
             plugged: 0,
+            unusable: 0,
             ages: Vec::new(),
             numbers: Vec::new(),
             levels: [[0; 256]; CHANNELS],
@@ -272,30 +307,22 @@ impl Gatherer {
         }
     }
 
-    /// Takes the sample of a row; returns whether it can be used.
-    fn add(&mut self, row: usize, payload: &Payload, is_valid: bool) -> Result<bool, Refusal> {
+    /// Takes the sample of a row; returns whether it can be used. All have one form.
+    fn add(&mut self, row: usize, payload: &Payload, is_valid: bool) -> bool {
         if !is_usable(self.kind, payload) {
-            return Ok(false);
+            return false;
         }
         match (&mut self.content, payload) {
             (Content::Camera { found, .. }, Payload::Picture { encoding, width, height, bytes }) => {
-                let Some(shape) = picture::shape(payload) else { return Ok(false) };
-                let expected = *found.get_or_insert(shape);
-                if shape != expected {
-                    let (found, expected) = (shape.to_string(), expected.to_string());
-                    return Err(Refusal::Size { name: self.name.clone(), frame: row, found, expected });
-                }
+                *found = found.or_else(|| picture::shape(payload));
                 if is_valid && self.pictured.binary_search(&row).is_ok() {
                     let picture = Picture { encoding: *encoding, width: *width, height: *height, bytes };
                     self.count_levels(&picture);
                 }
             }
             (Content::Vector { found, .. }, Payload::Numbers(numbers)) => {
-                let expected = *found.get_or_insert(numbers.len());
-                if numbers.len() != expected {
-                    return Err(Refusal::Length { name: self.name.clone(), found: numbers.len(), expected });
-                }
-                self.numbers.resize(expected, Vec::new());
+                *found = Some(numbers.len());
+                self.numbers.resize(numbers.len(), Vec::new());
                 if is_valid {
                     for (column, number) in self.numbers.iter_mut().zip(numbers) {
                         column.push(f64::from(narrow(*number)));
@@ -304,7 +331,7 @@ impl Gatherer {
             }
             _ => {}
         }
-        Ok(true)
+        true
     }
 
     /// Counts the levels of a picture's pixels; one that is damaged within does not count.

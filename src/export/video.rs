@@ -52,7 +52,7 @@ impl FrameMaker {
             Some(Payload::Picture { encoding, width, height, bytes }) => {
                 let (encoding, width, height) = (*encoding, *width, *height);
                 let decoded = self.pixels.decode(&Picture { encoding, width, height, bytes });
-                // The survey has refused other sizes.
+                // Another size is in no row.
                 let is_whole = decoded.is_ok() && self.pixels.values().len() == length(shape);
                 if is_whole { Shown::Picture } else { Shown::Damaged }
             }

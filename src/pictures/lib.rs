@@ -6,5 +6,6 @@
 #![forbid(unsafe_code)]
 
 pub mod jpeg;
+pub mod judge;
 pub mod pixels;
 pub mod qr;

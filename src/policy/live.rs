@@ -89,8 +89,10 @@ impl Live {
             .name("policy".to_owned())
             .spawn(move || compute(model, &received, &answered))?;
         let values = options.bundle.action.len();
+        let mut pilot = Pilot::new(&options.bundle, registry, options.without_mask, options.seed);
+        pilot.observer.share(board.walked());
         let control = Control {
-            pilot: Pilot::new(&options.bundle, registry, options.without_mask, options.seed),
+            pilot,
             inbox,
             actions: actions.filter(|_| !options.dry_run),
             board,

@@ -12,6 +12,7 @@
 //!
 //! Invariant: nothing here allocates once the places of the samples have grown to the largest.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use rapid_core::mask::PhysicalMask;
@@ -19,6 +20,8 @@ use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Epoch, FLAG_ERROR, SampleHeader};
 use rapid_core::sync::{SyncModality, SyncSample, Synchronizer, WhenStale};
 use rapid_core::time::Stamp;
+use rapid_core::walked::WalkedPictures;
+use rapid_pictures::judge::PictureJudge;
 use rapid_registry::Registry;
 
 use super::bundle::{Bundle, WhenAbsent};
@@ -28,6 +31,7 @@ use super::request::Request;
 #[derive(Debug)]
 pub struct Observer {
     sync: Synchronizer<usize>,
+    judge: PictureJudge,
     buffers: Vec<ObservationBuffer>,
     /// Of the last tick that was observed.
     number: Option<u64>,
@@ -174,16 +178,26 @@ impl Observer {
             }
         });
         Self {
+            judge: PictureJudge::alone(),
             buffers: buffers.collect(),
             sync: Synchronizer::new(&modalities, registry.rig.sync_window),
             number: None,
         }
     }
 
-    /// Stores a sample; ignores samples of modalities that the policy does not observe, and samples marked as damaged
-    /// by their device.
+    /// Looks up what others in the process have found of pictures.
+    pub fn share(&mut self, walked: Arc<WalkedPictures>) {
+        self.judge = PictureJudge::sharing(walked);
+    }
+
+    /// Stores a sample; ignores samples of modalities that the policy does not observe, samples marked as damaged by their
+    /// device, and pictures that are not usable.
     pub fn push(&mut self, id: ModalityId, header: &SampleHeader, payload: &[u8]) {
-        if header.flags & FLAG_ERROR != 0 {
+        if !self.buffers.iter().any(|buffer| buffer.id == Some(id)) {
+            return;
+        }
+        let is_usable = self.judge.sample(id, header, payload).is_usable();
+        if header.flags & FLAG_ERROR != 0 || !is_usable {
             return;
         }
         // Observations of one modality (two ways to process one camera) use the same index: the first of them

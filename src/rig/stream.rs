@@ -14,7 +14,7 @@ use std::time::Duration;
 use rapid_bus::Writer;
 use rapid_core::action::ActuatorNotice;
 use rapid_core::modality::ModalityId;
-use rapid_core::sample::{Epoch, SampleHeader};
+use rapid_core::sample::{Epoch, SampleHeader, damage};
 use rapid_core::time::{Stamp, nanoseconds};
 use rapid_devices::driver::{ClockOffset, Driver, DriverError, Reading};
 use rapid_devices::inputs::tap::{Tap, lost_at_the_end};
@@ -325,7 +325,7 @@ impl Stream {
             id: u32::from(self.spec.id.bit()),
             epoch: self.epoch.0,
             encoding: reading.encoding as u32,
-            flags: reading.flags,
+            flags: reading.flags | damage(reading.encoding, reading.bytes),
             width: reading.width,
             height: reading.height,
         };

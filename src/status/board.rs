@@ -19,6 +19,7 @@ use rapid_core::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
 use rapid_core::sample::{Epoch, SampleHeader};
 use rapid_core::text;
 use rapid_core::time::{Stamp, realtime_ns};
+use rapid_core::walked::WalkedPictures;
 use rapid_registry::{DeviceSpec, Registry};
 use tokio::sync::broadcast;
 
@@ -144,6 +145,7 @@ pub struct Board {
     looks: Vec<AtomicU64>,
     state: Mutex<State>,
     events: broadcast::Sender<Event>,
+    walked: Arc<WalkedPictures>,
 }
 
 /// What a snapshot shows besides the counters and the mask.
@@ -262,6 +264,7 @@ impl Board {
             looks: (0..MAX_MODALITIES).map(|_| AtomicU64::new(0)).collect(),
             state: Mutex::new(State::new(registry)),
             events: broadcast::channel(EVENT_DEPTH).0,
+            walked: Arc::default(),
         }
     }
 
@@ -427,6 +430,11 @@ impl Board {
     /// The newest sample of a device that is looked at, if there is one.
     pub fn newest_preview(&self, id: ModalityId) -> Option<Arc<Preview>> {
         self.state().preview(id).cloned()
+    }
+
+    /// What was found of the pictures of the run.
+    pub fn walked(&self) -> Arc<WalkedPictures> {
+        Arc::clone(&self.walked)
     }
 
     /// The modalities whose samples are pictures.

@@ -6,6 +6,7 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "what fails here fails a test")]
 
+use std::sync::LazyLock;
 use std::time::Duration;
 
 use rapid_core::mask::PhysicalMask;
@@ -21,7 +22,7 @@ use rapid_policy::pilot::Pilot;
 use rapid_policy::request::Request;
 use rapid_policy::sampler::Computing;
 use rapid_registry::Registry;
-use rapid_registry::simulation::task::layout;
+use rapid_registry::simulation::task::{SIDE, layout};
 use rapid_registry::task::PARTS;
 
 use crate::support::allocations::allocations;
@@ -57,10 +58,19 @@ fn warm_up(registry: &Registry) -> u64 {
     2 * registry.devices.iter().map(|device| device.depth as u64).max().unwrap()
 }
 
+/// A picture of the size that the devices of the task send.
+static JPEG: LazyLock<Vec<u8>> = LazyLock::new(|| {
+    let mut jpeg = Vec::new();
+    let side = u16::try_from(SIDE).unwrap();
+    let pixels = vec![90; SIDE * SIDE * 3];
+    rapid_pictures::jpeg::encode(&pixels, [side; 2], rapid_pictures::jpeg::Values::Rgb, 50, &mut jpeg).unwrap();
+    jpeg
+});
+
 /// Of the devices of the task, the samples of a tick, captured before it: as large as they get, or of a size that
 /// goes up and down. Now and then one is damaged.
 fn samples(registry: &Registry, tick: u64, large: bool, mut take: impl FnMut(usize, &SampleHeader, &[u8])) {
-    let bytes = [7; LARGEST];
+    let mut bytes = [7; LARGEST];
     let captured = at(tick).0 - 5_000_000;
     for (place, (name, part)) in PARTS.iter().enumerate() {
         let (encoding, width, height) = layout(*part);
@@ -77,6 +87,10 @@ fn samples(registry: &Registry, tick: u64, large: bool, mut take: impl FnMut(usi
             ..SampleHeader::default()
         };
         let len = if large { LARGEST } else { usize::try_from(tick * 131 % LARGEST as u64).unwrap() };
+        // A whole picture, with any number of bytes behind its end.
+        let jpeg: &[u8] = if encoding == Encoding::Mjpeg { &JPEG } else { &[] };
+        let len = len.max(jpeg.len());
+        bytes[..jpeg.len()].copy_from_slice(jpeg);
         // The rig with the arm has no phone.
         let Some(device) = registry.devices.iter().position(|device| device.name == *name) else { continue };
         take(device, &header, &bytes[..len]);

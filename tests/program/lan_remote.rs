@@ -16,18 +16,22 @@ use crate::support::{self, Episode, EventMessage, Place, until};
 /// The clock there is 1000 s ahead.
 const OFFSET: i64 = 1_000_000_000_000;
 
+/// The device that a request asks for.
+fn asked(stream: &mut TcpStream) -> Option<String> {
+    let mut line = Vec::new();
+    while line.last() != Some(&b'\n') {
+        let mut byte = [0];
+        stream.read_exact(&mut byte).ok()?;
+        line.push(byte[0]);
+    }
+    let (host, device) = requested(line.trim_ascii_end())?;
+    (host == "robot-b").then(|| device.to_owned())
+}
+
 /// Sends `cam_wrist` of robot-b at 50 Hz, with a clock that is known to `uncertainty_ns`, and refuses any other.
 fn remote(uncertainty_ns: u64) -> impl Fn(TcpStream) + Send + Sync {
     move |mut stream| {
-        let mut line = Vec::new();
-        while line.last() != Some(&b'\n') {
-            let mut byte = [0];
-            if !matches!(stream.read(&mut byte), Ok(1)) {
-                return;
-            }
-            line.push(byte[0]);
-        }
-        if requested(line.trim_ascii_end()) != Some(("robot-b", "cam_wrist")) {
+        if asked(&mut stream).as_deref() != Some("cam_wrist") {
             let head = Head { kind: Kind::Refused, length: 6, ..Head::default() };
             let _ = stream.write_all(&[&head.bytes()[..], b"absent"].concat());
             return;
@@ -126,4 +130,78 @@ fn a_sensor_in_another_format_fails_with_the_line_to_write() {
     let failed = reported.iter().find(|event| event["state"] == "failed").expect("failed");
     let detail = failed["detail"].as_str().expect("text");
     assert!(detail.contains("write kind = \"image\" and format = \"MJPG\" in [device.cam.lan]"), "{detail}");
+}
+
+/// Sends two numbers at 50 Hz: of `fine` both finite, of any other device one of them, in each `every`th sample, that is
+/// not.
+fn numbers(mut stream: TcpStream) {
+    let Some(device) = asked(&mut stream) else { return };
+    let (bad, every) = match device.as_str() {
+        "nan" => (f64::NAN, 1),
+        "inf" => (f64::NEG_INFINITY, 1),
+        "some" => (f64::NAN, 2),
+        _ => (0.0, 1),
+    };
+    for number in 0_u32.. {
+        let second = if number.is_multiple_of(every) { bad } else { 0.5 };
+        let payload = [f64::from(number).to_le_bytes(), second.to_le_bytes()].concat();
+        let head = Head {
+            kind: Kind::Sample,
+            length: 16,
+            encoding: Some(Encoding::F64),
+            seq: number.into(),
+            capture_ns: Stamp::now().0,
+            ..Head::default()
+        };
+        let sent =
+            [&Head::default().bytes()[..], &head.bytes(), &payload].iter().all(|part| stream.write_all(part).is_ok());
+        if !sent {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[test]
+fn numbers_that_are_not_finite_are_damaged_and_in_no_frame() {
+    let (place, [port]) = (Place::new(), free_ports());
+    let names = ["fine", "nan", "inf", "some"];
+    let entry = |(bit, name): (usize, &str)| {
+        format!(
+            "[device.{name}]\nnode = \"lan\"\nbit = {bit}\n[device.{name}.lan]\nprotocol = \"remote\"\n\
+             host = \"robot-b\"\ndevice = \"{name}\"\nport = {port}\nkind = \"scalars\"\nchannels = 2\n"
+        )
+    };
+    let entries: String = names.into_iter().enumerate().map(entry).collect();
+    place.write("devices.toml", &format!("{RIG}{entries}"));
+    let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
+    let _server = Server::start(port, numbers);
+    for name in names {
+        wait_for(&running, name, "streaming", 1);
+    }
+    until("a second of samples", || running.reported().iter().filter(|event| event["event"] == "clock").count() >= 12);
+    let reported = stop(running);
+    let ended = reported.iter().find(|event| event["event"] == "episode").expect("an episode");
+    let inspected = place.run(&["inspect", "--json", &format!("out/{}", place.files("out")[0])]);
+    let inspected: serde_json::Value = serde_json::from_slice(&inspected.stdout).expect("JSON");
+    assert_eq!(ended["reasons"], inspected["reasons"], "the recorder and a reader of the file agree");
+    let reasons = ended["reasons"].to_string();
+    for (modality, name) in inspected["modalities"].as_array().expect("modalities").iter().zip(names) {
+        let number = |key: &str| modality["quality"][key].as_u64().expect("a number");
+        let (samples, damaged, valid) = (number("samples"), number("damaged"), number("frames_valid"));
+        assert!(samples > 30, "{modality}");
+        let expected = match name {
+            "fine" => 0..=0,
+            // The first one recorded may be of either kind.
+            "some" => samples / 2..=samples.div_ceil(2),
+            _ => samples..=samples,
+        };
+        assert!(expected.contains(&damaged), "{damaged} of {samples}: {modality}");
+        assert_eq!(valid > 0, damaged < samples, "{modality}");
+        assert_eq!(
+            reasons.contains(&format!("{name}: {damaged} of {samples} samples damaged")),
+            damaged > 0,
+            "{reasons}"
+        );
+    }
 }

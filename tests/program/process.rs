@@ -293,6 +293,45 @@ fn a_crash_a_stall_and_an_unplug_are_three_things_in_every_frame_and_in_a_data_s
 }
 
 #[test]
+fn a_program_that_is_behind_is_never_good_however_far() {
+    let place = Place::new();
+    let behind = [0.0, 0.5, 9.0, 12.0, 3600.0, -0.5];
+    let entry = |(bit, behind): (usize, &f64)| {
+        format!(
+            "[device.by{bit}]\nvid = \"2e8a\"\npid = \"000a\"\nserial = \"C{bit}\"\nbit = {bit}\nnode = \"{}\"\n\
+             [device.by{bit}.process]\nargs = [\"--rate\", \"100\", \"--behind\", \"{behind}\"]\nkind = \"scalars\"\n\
+             channels = 2\n",
+            program().display()
+        )
+    };
+    place.write("devices.toml", &behind.iter().enumerate().map(entry).collect::<String>());
+    let run = [&sim(&place, "")[..], &["--record", "--duration", "3s", "--out", "out"]].concat();
+    let output = place.run(&run);
+    let reported = events(&String::from_utf8_lossy(&output.stdout));
+    let ended = find(&reported, |event| event["event"] == "episode", "episode");
+    let reasons: Vec<&str> = ended["reasons"].as_array().expect("reasons").iter().filter_map(Value::as_str).collect();
+    let inspected = place.run(&["inspect", "--json", &format!("out/{}", place.files("out")[0])]);
+    let inspected: Value = serde_json::from_slice(&inspected.stdout).expect("JSON");
+    assert_eq!(inspected["reasons"], ended["reasons"], "the recorder and a reader of the file agree");
+    let modalities = inspected["modalities"].as_array().expect("modalities");
+    for (bit, behind) in behind.iter().enumerate() {
+        let quality = &modalities[bit]["quality"];
+        let (valid, samples) = (quality["frames_valid"].as_u64(), quality["samples"].as_u64());
+        if *behind == 0.0 {
+            assert!(valid > Some(0), "{quality}");
+            continue;
+        }
+        let own = format!("by{bit}: ");
+        let is_known = |reason: &&&str| {
+            reason.starts_with(&own)
+                && ["damaged", "too late", "nothing was received"].iter().any(|why| reason.contains(why))
+        };
+        assert!(reasons.iter().any(|reason| is_known(&reason)), "{behind} s behind: {reasons:#?}");
+        assert!(valid == Some(0) || samples == Some(0), "{behind} s behind: {quality}");
+    }
+}
+
+#[test]
 fn a_program_that_floods_its_output_is_thinned_and_its_samples_are_whole() {
     let place = Place::new();
     registry(&place, ", \"--flood-stderr\"", "");

@@ -2,7 +2,8 @@
 //!
 //! A malformed message (overlong, badly stuffed, wrong count, not numbers) is skipped and counted in `lost` of the next
 //! reading; it never ends the stream. Bytes before the first message boundary after opening are the tail of a message
-//! and dropped without being counted. `nan` and `inf` are valid values and are passed on unchanged.
+//! and dropped without being counted. `nan` and `inf` are numbers here and are passed on unchanged:
+//! every sample with one of them is damaged ([`rapid_core::sample::damage`]).
 //!
 //! Invariant: the messages depend only on the bytes, not on how reads divide them.
 //! Invariant: memory is bounded by the longest permitted message, whatever the device sends; longer ones are not held, and a

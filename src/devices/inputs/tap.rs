@@ -102,7 +102,8 @@ impl Tap {
 
 fn number(bytes: &[u8], index: usize) -> Option<f64> {
     let (numbers, _) = bytes.as_chunks::<8>();
-    numbers.get(index).map(|number| f64::from_le_bytes(*number))
+    // One that is not finite is on no side of a limit: the input is lost, which stops.
+    numbers.get(index).map(|number| f64::from_le_bytes(*number)).filter(|number| number.is_finite())
 }
 
 /// Reports the taps as lost when it is dropped.

@@ -34,7 +34,6 @@ use std::path::PathBuf;
 
 pub use crate::chunk_writer::Sink;
 pub use episode_path::{EpisodeRequest, open_folder};
-pub use quality::is_whole_jpeg;
 pub use quality::{Quality, Spread};
 pub use recorder::{Recorder, RecorderAddition, RecorderConfig, Source};
 pub use space::Asker;

@@ -24,9 +24,10 @@ use std::time::Duration;
 
 use rapid_core::mask::{Bits, PhysicalMask};
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};
-use rapid_core::sample::{Encoding, Epoch, FLAG_ERROR, SampleHeader};
+use rapid_core::sample::{Epoch, FLAG_ERROR, SampleHeader, are_usable_numbers};
 use rapid_core::sync::{Grid, SyncSample, Synchronizer};
 use rapid_core::time::{Stamp, WallClock};
+use rapid_pictures::judge::PictureJudge;
 use rapid_registry::{DeviceSpec, ModuleSpec, Registry};
 use rapid_status::{Board, EpisodeReport, Event, EventKind, Level, Outlook, RecordingStatus};
 
@@ -99,6 +100,7 @@ pub(super) struct OpenEpisode {
     grid: Grid,
     next_tick: u64,
     sync: Synchronizer<()>,
+    judge: PictureJudge,
     measures: Measures,
     announced: Vec<Announced>,
     missing: Missing,
@@ -146,6 +148,7 @@ impl OpenEpisode {
         file.flush()?;
         let kept = |device: &DeviceSpec| device.depth.saturating_add(RING_SLACK);
         let modalities: Vec<_> = registry.devices.iter().map(|device| device.synchronised(kept(device))).collect();
+        let judge = PictureJudge::sharing(board.walked());
         let writeback = Writeback::start(Arc::clone(&path.file), &path.folder);
         Ok(Self {
             sync: Synchronizer::new(&modalities, registry.rig.sync_window),
@@ -157,6 +160,7 @@ impl OpenEpisode {
             file,
             writeback,
             begin,
+            judge,
             next_tick: 0,
             measures,
             announced: vec![Announced::default(); MAX_MODALITIES],
@@ -191,17 +195,18 @@ impl OpenEpisode {
             return;
         }
         let flagged = header.flags & FLAG_ERROR != 0;
+        let picture = self.judge.sample(id, header, payload);
         let seen = SampleFacts {
             seq: header.seq,
             capture_ns: header.capture_ns,
             recv_ns: header.recv_ns,
             flagged,
-            jpeg: Encoding::from_raw(header.encoding) == Some(Encoding::Mjpeg),
+            picture,
             payload,
             repeated,
         };
         self.measures.sample(id, &seen);
-        if flagged {
+        if flagged || !picture.is_usable() {
             return;
         }
         let sample = SyncSample {
@@ -235,6 +240,7 @@ impl OpenEpisode {
             self.missing.actions = self.missing.actions.saturating_add(missing);
         }
         if self.holds(Stamp(header.capture_ns), Duration::ZERO) && self.failed.is_none() {
+            self.missing.unusable_actions += u64::from(!are_usable_numbers(payload));
             self.failed = self.file.action(header, payload).err();
         }
     }

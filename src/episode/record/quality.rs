@@ -19,6 +19,7 @@ use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 use rapid_core::sync::Grid;
 use rapid_core::time::{Stamp, nanoseconds};
+use rapid_pictures::judge::Judgement;
 use rapid_registry::{DeviceSpec, Registry, VerdictSpec};
 use serde::Serialize;
 
@@ -87,10 +88,12 @@ pub struct Quality {
     pub lost: u64,
     /// Samples lost between the driver and the file.
     pub dropped: u64,
-    /// Samples that the driver called damaged, and pictures that are not whole.
+    /// Samples that the driver called damaged, and pictures that are not usable.
     pub damaged: u64,
-    /// Of `damaged`, JPEG pictures without their beginning or their end.
+    /// Of `damaged`, pictures that lack a part or are damaged inside.
     pub truncated: u64,
+    /// Of `damaged`, pictures of another size or kind than the camera's.
+    pub other_shape: u64,
     /// Samples with a non-increasing sequence number or capture time.
     pub duplicates: u64,
     /// Samples that equal the previous one byte for byte; not counted if payloads are not compared.
@@ -344,8 +347,8 @@ pub(super) struct SampleFacts<'a> {
     pub(super) recv_ns: u64,
     /// The driver called it damaged.
     pub(super) flagged: bool,
-    /// It is a JPEG picture.
-    pub(super) jpeg: bool,
+    /// Whether it is usable, if it is a picture.
+    pub(super) picture: Judgement,
     pub(super) payload: &'a [u8],
     /// The bytes equal those of the previous sample; `None`: to be determined here by hashing.
     pub(super) repeated: Option<bool>,
@@ -428,9 +431,9 @@ impl Meter {
         let first = self.seq.is_none();
         self.counts.samples += 1;
         self.counts.bytes += seen.payload.len() as u64;
-        let truncated = seen.jpeg && !is_whole_jpeg(seen.payload);
-        self.counts.truncated += u64::from(truncated);
-        self.counts.damaged += u64::from(truncated || seen.flagged);
+        self.counts.truncated += u64::from(seen.picture == Judgement::NotWhole);
+        self.counts.other_shape += u64::from(seen.picture == Judgement::OtherShape);
+        self.counts.damaged += u64::from(!seen.picture.is_usable() || seen.flagged);
         // A lower number at a later time is a restarted publisher.
         let again = self.seq == Some(seen.seq) || (!first && seen.capture_ns <= self.latest_ns);
         self.counts.duplicates += u64::from(again);
@@ -480,19 +483,6 @@ impl Meter {
             self.repeats.push(None);
         }
     }
-}
-
-/// Start of image and end of image (ITU-T T.81, table B.1).
-const SOI: [u8; 2] = [0xff, 0xd8];
-const EOI: [u8; 2] = [0xff, 0xd9];
-
-/// Does a payload begin and end like a JPEG picture? Checks two bytes at each end; padding of zeros, as of some
-/// cameras, does not count.
-pub fn is_whole_jpeg(payload: &[u8]) -> bool {
-    let end = payload.iter().rposition(|byte| *byte != 0).map_or(0, |last| last + 1);
-    let picture = payload.get(..end).unwrap_or_default();
-    // Both markers, each with bytes of its own.
-    picture.len() >= 4 && picture.starts_with(&SOI) && picture.ends_with(&EOI)
 }
 
 /// Number of parts of an episode; when more are needed, parts are merged in pairs.

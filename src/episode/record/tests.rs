@@ -147,10 +147,13 @@ fn id(bit: u8) -> ModalityId {
     ModalityId::new(bit).unwrap()
 }
 
-/// What a picture looks like from outside.
+/// A picture of eight by eight pixels, with its number in a comment.
 fn picture(number: u64) -> Vec<u8> {
+    let mut jpeg = Vec::new();
+    rapid_pictures::jpeg::encode(&[90; 64], [8, 8], rapid_pictures::jpeg::Values::Grey, 90, &mut jpeg).unwrap();
     let inside = number.to_le_bytes().repeat(100);
-    [&[0xff, 0xd8], inside.as_slice(), &[0xff, 0xd9]].concat()
+    let length = u16::try_from(inside.len() + 2).unwrap().to_be_bytes();
+    [&jpeg[..2], &[0xff, 0xfe], &length, &inside, &jpeg[2..]].concat()
 }
 
 pub(crate) fn registry() -> Registry {
@@ -240,6 +243,34 @@ impl Bench {
         for what in within {
             self.board.announce(what);
         }
+        self.until_file(&finished).await;
+        finished
+    }
+
+    /// Half a second in which `tof` is present and sends `numbers`, without a flag: as recorders of earlier versions took them.
+    pub(crate) async fn half_a_second_of(&mut self, numbers: impl Fn(u64) -> [f64; 2] + Send + 'static) -> PathBuf {
+        self.mask(0b10, 1, Stamp::now().0);
+        self.script.taken().await;
+        let script = self.script.clone();
+        *self.at_begin.lock().unwrap() = Some(Box::new(move |begin| {
+            for n in 0..50 {
+                let capture_ns = begin.0 + (1 + n * 10) * MS;
+                script.mask(0b10, n + 2, capture_ns);
+                let header = SampleHeader {
+                    seq: n,
+                    capture_ns,
+                    recv_ns: capture_ns,
+                    id: TOF.into(),
+                    epoch: 1,
+                    encoding: Encoding::F64 as u32,
+                    width: 2,
+                    ..SampleHeader::default()
+                };
+                let payload = numbers(n).into_iter().flat_map(f64::to_le_bytes).collect();
+                script.put((TopicId::Modality(id(TOF)), header, payload));
+            }
+        }));
+        let finished = self.recorder.start(self.request(Some(Duration::from_millis(500)))).await.unwrap();
         self.until_file(&finished).await;
         finished
     }

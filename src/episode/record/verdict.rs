@@ -20,6 +20,7 @@ mod tests;
 
 use std::time::Duration;
 
+use rapid_core::text;
 use rapid_registry::{Limits, VerdictSpec};
 use rapid_status::{Finding, Grade, Sensors, Verdict};
 
@@ -60,6 +61,8 @@ pub(super) struct Missing {
     /// Publications of the mask.
     pub(super) masks: u64,
     pub(super) actions: u64,
+    /// Actions in the file with a number that is not finite: no actuator carries them out.
+    pub(super) unusable_actions: u64,
     pub(super) events: u64,
 }
 
@@ -144,6 +147,10 @@ pub(super) fn findings(facts: &Facts<'_>) -> Vec<Finding> {
         let are = if count == 1 { is } else { are };
         found.push(of_all(Grade::Suspect, format!("{count} {are} not in the file (limit 0)")));
     }
+    if facts.missing.unusable_actions > 0 {
+        let actions = text::counted(facts.missing.unusable_actions, "action");
+        found.push(of_all(Grade::Suspect, format!("{actions} with a number that is not finite (limit 0)")));
+    }
     found.extend(facts.publishers.iter().map(|publisher| of_all(Grade::Suspect, publisher.reason())));
     // Stable: of one grade in the order above.
     found.sort_by_key(|finding| std::cmp::Reverse(finding.grade));
@@ -176,11 +183,7 @@ fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
             Losses::Together => "missing, lost by the device or dropped on the way to the file",
         },
     );
-    let cut = match quality.truncated {
-        0 => "damaged".to_owned(),
-        cut if cut == quality.damaged => "not whole pictures".to_owned(),
-        cut => format!("damaged, {cut} of them not whole pictures"),
-    };
+    let cut = damaged_text(quality);
     let damaged = share(|limits| limits.damaged, quality.damaged, &cut);
     let duplicate =
         share(|limits| limits.duplicate, quality.duplicates, "with a non-increasing sequence number or capture time");
@@ -220,6 +223,19 @@ fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
     .into_iter()
     .flatten()
     .collect()
+}
+
+/// How the damaged samples are damaged.
+fn damaged_text(quality: &Quality) -> String {
+    let Quality { damaged, truncated, other_shape, .. } = *quality;
+    match (truncated, other_shape) {
+        (0, 0) => "damaged".to_owned(),
+        (cut, _) if cut == damaged => "not whole pictures".to_owned(),
+        (_, other) if other == damaged => "with a picture of another size or kind".to_owned(),
+        (cut, 0) => format!("damaged, {cut} of them not whole pictures"),
+        (0, other) => format!("damaged, {other} of them with a picture of another size or kind"),
+        (cut, other) => format!("damaged, {cut} of them not whole pictures, {other} of another size or kind"),
+    }
 }
 
 /// The findings of a modality that sent nothing and was present too briefly to be missing.

@@ -324,3 +324,50 @@ proptest! {
         }
     }
 }
+
+/// Whatever is wrong with it, also if it is the first: the policy sees the whole one, and none before that.
+#[test]
+fn a_picture_that_is_not_usable_is_never_observed() {
+    use rapid_core::sample::Encoding;
+    use rapid_pictures::jpeg::{Values, encode};
+    let encoded = |side: u16| {
+        let pixels: Vec<u8> = (0..usize::from(side).pow(2)).map(|at| u8::try_from(at * at % 251).unwrap()).collect();
+        let mut jpeg = Vec::new();
+        encode(&pixels, [side, side], Values::Grey, 90, &mut jpeg).unwrap();
+        jpeg
+    };
+    let whole = encoded(64);
+    let lost = [&whole[..400], &whole[500..]].concat();
+    let bundle = bundle(|_| {});
+    for (name, payload, flags) in
+        [("damaged inside", lost, 0), ("another size", encoded(32), 0), ("flagged", whole.clone(), FLAG_ERROR)]
+    {
+        let mut observer = observer(&bundle, 60);
+        let id = observer.buffers[0].id.unwrap();
+        let mut push = |tick: u64, payload: &[u8], flags| {
+            let captured = at(tick).0 - 5_000_000;
+            let encoding = Encoding::Mjpeg as u32;
+            let header = SampleHeader {
+                seq: tick,
+                capture_ns: captured,
+                recv_ns: captured,
+                encoding,
+                flags,
+                ..SampleHeader::default()
+            };
+            observer.push(id, &header, payload);
+            observer.observe(tick, at(tick), at(tick), ARM);
+            let mut request = Request::new(&bundle);
+            (request.tick, request.stamp) = (tick, at(tick));
+            observer.fill(&mut request);
+            request.cell(0, 2).filter(|_| request.is_present(0)).map(|cell| (cell.seq, cell.bytes.clone()))
+        };
+        // One of another size is known for one only beside others.
+        if name != "another size" {
+            assert_eq!(push(0, &payload, flags), None, "{name}, first");
+        }
+        assert_eq!(push(1, &whole, 0), Some((1, whole.clone())), "{name}");
+        assert_eq!(push(2, &payload, flags), Some((1, whole.clone())), "{name}");
+        assert_eq!(push(3, &whole, 0), Some((3, whole.clone())), "{name}");
+    }
+}

@@ -24,7 +24,7 @@ keys! {
         lost = SHARE, usually "1 %, 5 %";
         /// Samples lost between the driver and the file.
         dropped = SHARE, usually "0, 5 %";
-        /// Samples that the driver reported as damaged, and JPEG pictures without their beginning or end.
+        /// Samples that the driver reported as damaged, pictures that are not usable, and samples with a number that is not finite.
         damaged = SHARE, usually "1 %, 5 %";
         /// Samples with a non-increasing sequence number or capture time.
         duplicate = SHARE, usually "0.1 %, 5 %";

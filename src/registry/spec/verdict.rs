@@ -15,7 +15,8 @@ pub struct Limits {
     pub lost: Option<f64>,
     /// Samples lost between the driver and the file.
     pub dropped: Option<f64>,
-    /// Samples that the driver reported as damaged, and JPEG pictures without their beginning or end.
+    /// Samples that the driver reported as damaged, pictures that are not whole or of another size or kind than the
+    /// camera's, and samples with a number that is not finite.
     pub damaged: Option<f64>,
     /// Samples with a non-increasing sequence number or capture time.
     pub duplicate: Option<f64>,

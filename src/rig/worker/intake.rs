@@ -2,7 +2,10 @@
 //!
 //! 1. Modality and epoch must be ours: a sample of an earlier process does not belong to this device.
 //! 2. The payload must be what the entry declares, or the sample is refused.
-//! 3. An impossible capture time is replaced by the time of arrival; time never goes back.
+//! 3. A capture time that cannot be one (in the future, older than [`OLDEST`], or before that of an earlier sample) makes
+//!    the sample damaged: nothing says when it was captured. Its stamp is an estimate, by the delay of the sample before
+//!    it, so that it has a place in a recording. Older means late or damaged, never better: up to [`OLDEST`] a sample
+//!    keeps its capture time, and the verdict counts it as late.
 //! 4. A gap in `seq` is a loss; a counter that jumps or restarts is not.
 //!
 //! Invariant: pure; nothing a program can write makes this panic, or passes a number that our own driver would not have
@@ -15,7 +18,8 @@ use rapid_core::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, FLAG_ERROR, SampleHe
 use rapid_core::time::Stamp;
 use rapid_registry::ProcessSpec;
 
-/// A sample that claims to be older than this is not believed.
+/// A sample that claims to be older than this is not believed: no program takes that long, but a clock of another
+/// origin looks like this.
 const OLDEST: Duration = Duration::from_secs(10);
 /// A larger gap means that the counter was set.
 const LARGEST_HOLE: u64 = 1_000_000;
@@ -63,6 +67,10 @@ pub(super) struct Intake {
     epoch: u32,
     expected: Expected,
     last: Option<u64>,
+    /// The newest capture time that was believed, and how long that sample took.
+    believed: Stamp,
+    delay: Duration,
+    /// The newest stamp that was passed on.
     newest: Stamp,
     /// A complaint that has not been fetched, and whether one of its kind came before.
     complaint: Option<String>,
@@ -83,6 +91,8 @@ impl Intake {
             epoch: epoch.0,
             expected,
             last: None,
+            believed: Stamp::default(),
+            delay: Duration::ZERO,
             newest: Stamp::default(),
             complaint: None,
             has_refused: false,
@@ -101,23 +111,44 @@ impl Intake {
                 return None;
             }
         };
-        let report = Stamp(header.capture_ns);
-        let is_possible = report <= now && now.since(report) <= OLDEST;
-        // Zero: the program does not know.
-        if !is_possible && report != Stamp::default() && !std::mem::replace(&mut self.has_doubted, true) {
-            self.complaint =
-                Some("its capture times are not those of CLOCK_MONOTONIC; the time of arrival is used".to_owned());
-        }
-        let mut flags = header.flags & (FLAG_ERROR | FLAG_DEVICE_TIME);
-        if !is_possible {
-            flags &= !FLAG_DEVICE_TIME;
-        }
-        let captured = if is_possible { report } else { now }.max(self.newest);
-        self.newest = captured;
+        let (captured, flags) = self.time(header, now);
         let hole = self.last.and_then(|last| header.seq.checked_sub(last)?.checked_sub(1));
         self.last = Some(header.seq);
         let lost = hole.filter(|hole| *hole <= LARGEST_HOLE).unwrap_or(0);
         Some(Judged { encoding, captured, flags, width, height, lost })
+    }
+
+    /// When a sample was captured, and its flags.
+    fn time(&mut self, header: &SampleHeader, now: Stamp) -> (Stamp, u32) {
+        let report = Stamp(header.capture_ns);
+        let mut flags = header.flags & (FLAG_ERROR | FLAG_DEVICE_TIME);
+        let doubt = match now.since(report) {
+            // The program does not know: the sample has the time of its arrival.
+            _ if report == Stamp::default() => None,
+            _ if report > now => Some(format!("{:?} in the future", report.since(now))),
+            age if age > OLDEST => Some(format!("{age:?} old")),
+            _ if report < self.believed => Some(format!("{:?} before the one before", self.believed.since(report))),
+            age => {
+                (self.believed, self.delay) = (report, age);
+                // An estimate before it may be later than it, by as much as the delay varies.
+                let after = self.newest.after(Duration::from_nanos(1)).min(now);
+                self.newest = if report < self.newest { after } else { report };
+                return (self.newest, flags);
+            }
+        };
+        flags &= !FLAG_DEVICE_TIME;
+        if let Some(doubt) = doubt {
+            flags |= FLAG_ERROR;
+            if !std::mem::replace(&mut self.has_doubted, true) {
+                self.complaint = Some(format!(
+                    "samples are damaged, by a capture time that is {doubt}: send CLOCK_MONOTONIC, or 0 if it is not known"
+                ));
+            }
+            self.newest = self.newest.max(now.before(self.delay));
+        } else {
+            self.newest = self.newest.max(now);
+        }
+        (self.newest, flags)
     }
 
     /// A complaint for the user, the first time it occurs.

@@ -6,6 +6,7 @@ use std::time::Instant;
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use rapid_core::random::Random;
 use rapid_core::sample::Encoding;
+use rapid_pictures::jpeg::Walker;
 use rapid_policy::bundle::{Bundle, ImageSpec, ObservationInput};
 use rapid_policy::picture::{Picture, Preprocessor};
 use rapid_registry::simulation::TaskPart;
@@ -35,6 +36,7 @@ const TASK_QUALITY: u8 = 95;
 pub(crate) fn measure(bench: &Bench) -> Result<Vec<Figure>, Failure> {
     let bundle = Bundle::load(&bench.bundle)?;
     let mut figures = preprocessing(bench, &bundle)?;
+    figures.push(judging(bench)?);
     figures.extend(rendering(bench)?);
     Ok(figures)
 }
@@ -86,6 +88,30 @@ fn preprocessing(bench: &Bench, bundle: &Bundle) -> Result<Vec<Figure>, Failure>
         Figure::new("picture/of all cameras to tensors, cpu p50", "ms", work.quantile(0.5))
             .note("the thread's own time: what another program takes does not count"),
     ])
+}
+
+/// What it costs to find out whether pictures are whole, beside decoding them.
+fn judging(bench: &Bench) -> Result<Figure, Failure> {
+    /// Cameras, pictures a second of each, and bytes of a picture.
+    const LOAD: f64 = 3.0 * 30.0 * 100e3;
+    let pictures = bench.choose(2_000, 100);
+    let frames = (0..FRAMES).map(|number| frame(number * 2)).collect::<Result<Vec<_>, _>>()?;
+    let (mut walker, mut pixels) = (Walker::default(), Vec::new());
+    let (mut walked, mut decoded) = (Vec::new(), Vec::new());
+    for jpeg in frames.iter().cycle().take(pictures) {
+        let share = LOAD / jpeg.len() as f64 * 100.0;
+        let begun = thread_cpu_s();
+        black_box(walker.walk(black_box(jpeg))?);
+        let between = thread_cpu_s();
+        decode(jpeg, &mut pixels)?;
+        walked.push((between - begun) * share);
+        decoded.push((thread_cpu_s() - between) * share);
+    }
+    let [walked, decoded] = [walked, decoded].map(Sorted::new);
+    Ok(Figure::new("picture/judging 3 cameras of 100 kB at 30 Hz, of a core", "%", walked.quantile(0.5))
+        .baseline(decoded.quantile(0.5))
+        .target("<= 5")
+        .note(format!("{pictures} pictures, each walked once; baseline: decoding them")))
 }
 
 fn decode(jpeg: &[u8], pixels: &mut Vec<u8>) -> Result<(), Failure> {

@@ -281,5 +281,33 @@ pub(super) fn boundary(content_type: &str) -> Option<&str> {
     (!value.is_empty()).then_some(value)
 }
 
+/// Result of looking for a boundary that was not announced.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Sniffed {
+    /// More bytes are needed.
+    Open,
+    /// The body begins with it.
+    Boundary(String),
+    /// The body begins with something else.
+    Nothing,
+}
+
+/// The boundary in the first line of a body, with or without empty lines before it.
+pub(super) fn sniff(begun: &[u8]) -> Sniffed {
+    let line = begun.trim_ascii_start();
+    let text = line.get(..memchr(b'\n', line).unwrap_or(line.len())).unwrap_or_default();
+    let is_boundary = text.iter().zip(b"--").all(|(byte, dash)| byte == dash);
+    if !is_boundary || begun.len() - line.len() + text.len() > 2 * LONGEST_LINE {
+        return Sniffed::Nothing;
+    }
+    if text.len() == line.len() {
+        return Sniffed::Open;
+    }
+    match std::str::from_utf8(text).map(|text| text.trim_end().trim_start_matches('-')) {
+        Ok("") | Err(_) => Sniffed::Nothing,
+        Ok(name) => Sniffed::Boundary(name.to_owned()),
+    }
+}
+
 #[cfg(test)]
 mod tests;

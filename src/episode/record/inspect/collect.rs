@@ -9,6 +9,7 @@ use std::path::Path;
 use rapid_core::action::ACTION_TOPIC;
 use rapid_core::mask::{MASK_TOPIC, PhysicalMask};
 use rapid_core::modality::ModalityId;
+use rapid_core::sample::are_usable_numbers;
 use rapid_core::topic::{EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC};
 
 use super::super::metadata::{CONFIGURATION, POLICY};
@@ -130,6 +131,11 @@ impl Collected {
             judge.sample(id, message, sample);
             self.counted.empty += u64::from(sample.is_none_or(|sample| sample.payload.is_empty()));
         }
+        if let Some(Content::Sample(sample)) = content
+            && channel.topic == ACTION_TOPIC
+        {
+            self.counted.missing.unusable_actions += u64::from(!are_usable_numbers(sample.payload));
+        }
         self.counted.frames += u64::from(channel.kind == Kind::Frame);
         match content {
             Some(Content::Mask(mask)) => self.mask(at, mask),
@@ -226,8 +232,12 @@ impl Collected {
             std::mem::take(&mut self.policy).report(end_ns, [self.summary.get(POLICY), self.about.get(POLICY)]);
         let (mut modalities, topics) = self.topics(begin_ns, seconds);
         let missing = |name| topics.iter().filter(|topic| topic.topic == name).map(|topic| topic.missing).sum();
-        self.counted.missing =
-            Missing { actions: missing(ACTION_TOPIC), masks: missing(MASK_TOPIC), events: missing(EVENT_TOPIC) };
+        self.counted.missing = Missing {
+            actions: missing(ACTION_TOPIC),
+            masks: missing(MASK_TOPIC),
+            events: missing(EVENT_TOPIC),
+            ..self.counted.missing
+        };
         self.counted.missing_frames = missing(FRAME_TOPIC);
         let repaired = state::repaired(&self.recovered);
         let (repaired, failed) = (repaired.as_deref(), failed.as_deref());
@@ -269,7 +279,7 @@ impl Collected {
             messages: counted.messages,
             dropped: state::sum(&self.summary, "dropped", &modalities, |quality| quality.dropped),
             lost: state::sum(&self.summary, "lost", &modalities, |quality| quality.lost),
-            damaged: answer(&self.summary, "damaged").parse().ok(),
+            damaged: state::sum(&self.summary, "damaged", &modalities, |quality| quality.damaged),
             frames: counted.frames,
             skew: judge.and_then(|judge| judge.skew()),
             modalities,

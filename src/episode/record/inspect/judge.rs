@@ -12,7 +12,8 @@ use std::time::Duration;
 
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
-use rapid_core::sample::Encoding;
+use rapid_core::sample::damage;
+use rapid_pictures::judge::{Judgement, PictureJudge};
 use rapid_registry::{Registry, VerdictSpec};
 use rapid_status::{Grade, Verdict};
 use serde_json::{Map, Value};
@@ -52,6 +53,7 @@ impl Numbers {
 #[derive(Debug)]
 pub(super) struct Judge {
     measures: Measures,
+    pictures: PictureJudge,
     begin_ns: u64,
     /// The registered modalities, ascending by bit.
     modalities: Vec<Measured>,
@@ -81,7 +83,16 @@ impl Judge {
         let measures = Measures::new(&modalities, Frames { begin_ns, hz, window, wait });
         let numbers = vec![Numbers::default(); MAX_MODALITIES];
         let publishers = Publishers::default();
-        let mut judge = Self { measures, begin_ns, modalities, usual_limits, expect, numbers, publishers };
+        let mut judge = Self {
+            measures,
+            pictures: PictureJudge::alone(),
+            begin_ns,
+            modalities,
+            usual_limits,
+            expect,
+            numbers,
+            publishers,
+        };
         let serials = about.get("serials").and_then(|text| serde_json::from_str::<Map<String, Value>>(text).ok());
         for device in serials.unwrap_or_default().keys() {
             judge.plugged(device, begin_ns, true);
@@ -120,12 +131,16 @@ impl Judge {
         if let Some(numbers) = self.numbers.get_mut(id.index()) {
             numbers.add(message.sequence);
         }
+        let picture = sample.map_or(Judgement::Usable, |sample| {
+            self.pictures.recorded(id, sample.encoding, [sample.width, sample.height], sample.payload)
+        });
         let seen = SampleFacts {
             seq: message.sequence.into(),
             capture_ns: message.log_time,
             recv_ns: message.publish_time,
-            flagged: false,
-            jpeg: sample.is_some_and(|sample| sample.encoding == Encoding::Mjpeg),
+            // The flag is not in the file: what its content shows, in files of earlier versions too.
+            flagged: sample.is_some_and(|sample| damage(sample.encoding, sample.payload) != 0),
+            picture,
             payload: sample.map_or(&[], |sample| sample.payload),
             repeated: None,
         };
@@ -184,6 +199,7 @@ impl Judge {
             missing: Missing {
                 masks: count("masks_dropped", missing.masks),
                 actions: count("actions_dropped", missing.actions),
+                unusable_actions: missing.unusable_actions,
                 events: count("events_missed", missing.events),
             },
             expect: &self.expect,
@@ -210,7 +226,7 @@ impl Judge {
             let all = gone.saturating_add(quality.lost).saturating_add(quality.dropped);
             (quality.lost, quality.dropped) = (0, all.max(missing));
         }
-        quality.damaged = quality.truncated.max(counted.of_modality(&known.name, "damaged").unwrap_or(0));
+        quality.damaged = quality.damaged.max(counted.of_modality(&known.name, "damaged").unwrap_or(0));
         Some(quality)
     }
 

@@ -74,6 +74,23 @@ async fn a_finished_episode_is_reported_as_recorded() {
 }
 
 #[tokio::test]
+async fn numbers_that_are_not_finite_are_damaged_in_files_without_the_flag() {
+    for (bad, every, damaged) in
+        [(f64::NAN, 1, 50), (f64::INFINITY, 10, 5), (f64::NEG_INFINITY, 10, 5), (1e39, 1, 50), (1e38, 1, 0)]
+    {
+        let numbers = move |n: u64| [n as f64, if n.is_multiple_of(every) { bad } else { 0.0 }];
+        let mut bench = Bench::new();
+        let file = bench.half_a_second_of(numbers).await;
+        let report = inspect(&file).unwrap();
+        let tof = report.modalities.iter().find(|modality| modality.name == "tof").unwrap();
+        assert_eq!(tof.quality.unwrap().damaged, damaged, "{bad}");
+        assert_eq!(report.damaged, Some(damaged), "{bad}");
+        let reason = format!("tof: {damaged} of 50 samples damaged (limit 5 %)");
+        assert_eq!(report.verdict.reasons().contains(&reason.as_str()), damaged > 2, "{bad}: {:?}", report.verdict);
+    }
+}
+
+#[tokio::test]
 async fn a_truncated_or_damaged_file_is_read_up_to_the_damage() {
     let (_bench, file) = episode().await;
     let bytes = std::fs::read(&file).unwrap();

@@ -35,7 +35,7 @@ fn seen(seq: u64, at: u64, late: u64, payload: &[u8]) -> SampleFacts<'_> {
         capture_ns,
         recv_ns: capture_ns + late * MS,
         flagged: false,
-        jpeg: false,
+        picture: Judgement::Usable,
         payload,
         repeated: None,
     }
@@ -46,42 +46,17 @@ fn quality_at(measures: &Measures, end_ms: u64) -> Quality {
 }
 
 #[test]
-fn a_picture_is_whole_if_it_begins_and_ends_with_the_jpeg_markers() {
-    for (payload, whole) in [
-        (&b"\xff\xd8\xff\xd9"[..], true),
-        (b"\xff\xd8 picture \xff\xd9", true),
-        (b"\xff\xd8 picture \xff\xd9\0\0\0", true),
-        (b"\xff\xd8 picture \xff", false),
-        (b"\xff\xd8 pict", false),
-        (b"\xff\xd8 pict\0\0\0\0", false),
-        (b"picture \xff\xd9", false),
-        (b"\xff\xd8\xd9", false),
-        (b"\xff\xd8", false),
-        (b"\0\0\0", false),
-        (b"", false),
-    ] {
-        assert_eq!(is_whole_jpeg(payload), whole, "{payload:?}");
-    }
-}
-
-#[test]
 fn damaged_counts_flagged_samples_and_torn_pictures_once() {
+    use Judgement::{NotWhole, OtherShape, Usable};
+
     let mut measures = measures(ModalityKind::Image);
-    for (n, (flagged, jpeg, payload)) in [
-        (false, true, &b"\xff\xd8a\xff\xd9"[..]),
-        (true, true, b"\xff\xd8b\xff\xd9"),
-        (false, true, b"\xff\xd8c"),
-        (true, true, b"\xff\xd8d"),
-        (false, false, b"not a picture"),
-    ]
-    .into_iter()
-    .enumerate()
+    for (n, (flagged, picture)) in
+        (0_u64..).zip([(false, Usable), (true, Usable), (false, NotWhole), (true, NotWhole), (false, OtherShape)])
     {
-        let n = n as u64;
-        measures.sample(id(0), &SampleFacts { flagged, jpeg, ..seen(n, n * 10, 1, payload) });
+        measures.sample(id(0), &SampleFacts { flagged, picture, ..seen(n, n * 10, 1, b"picture") });
     }
     let report = quality_at(&measures, 100);
-    assert_eq!((report.samples, report.damaged, report.truncated, report.bytes), (5, 3, 2, 5 + 5 + 3 + 3 + 13));
+    assert_eq!((report.samples, report.damaged, report.truncated, report.other_shape, report.bytes), (5, 4, 2, 1, 35));
 }
 
 #[test]
@@ -249,8 +224,15 @@ fn a_clock_at_another_rate_drifts_and_one_that_is_ahead_is_in_the_future() {
             let error = i64::try_from(n * 33 * MS).unwrap() * ppm / 1_000_000;
             let capture_ns = at.checked_add_signed(error).unwrap();
             let recv_ns = at + 20 * MS + n % 7 * jitter_ms * MS;
-            let seen =
-                SampleFacts { seq: n, capture_ns, recv_ns, flagged: false, jpeg: false, payload: b"", repeated: None };
+            let seen = SampleFacts {
+                seq: n,
+                capture_ns,
+                recv_ns,
+                flagged: false,
+                picture: Judgement::Usable,
+                payload: b"",
+                repeated: None,
+            };
             measures.sample(id(0), &seen);
         }
         quality_at(&measures, seconds * 1000)
@@ -356,12 +338,12 @@ proptest! {
     #[test]
     fn no_sample_causes_a_panic(samples in prop::collection::vec(any::<(u64, u64, u64, bool)>(), 0..40), end in any::<u64>()) {
         let mut measures = measures(ModalityKind::Image);
-        for (seq, capture_ns, recv_ns, jpeg) in &samples {
-            let seen = SampleFacts { seq: *seq, capture_ns: *capture_ns, recv_ns: *recv_ns, flagged: false, jpeg: *jpeg, payload: b"", repeated: None };
+        for (seq, capture_ns, recv_ns, cut) in &samples {
+            let seen = SampleFacts { seq: *seq, capture_ns: *capture_ns, recv_ns: *recv_ns, flagged: false, picture: if *cut { Judgement::NotWhole } else { Judgement::Usable }, payload: b"", repeated: None };
             measures.sample(id(0), &seen);
             measures.mask(*capture_ns, PhysicalMask(*seq));
             measures.missing(id(0), *seq, *recv_ns);
-            measures.frame([(id(0), *jpeg, Some(seq.cast_signed()))].into_iter());
+            measures.frame([(id(0), *cut, Some(seq.cast_signed()))].into_iter());
         }
         let report = measures.quality(id(0), end).unwrap();
         let most = samples.len() as u64;

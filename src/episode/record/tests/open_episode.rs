@@ -300,11 +300,13 @@ fn with_actuator() -> Registry {
     Registry::parse(&format!("{}{arm}", registry().text), None).unwrap().registry
 }
 
-/// Actions that arrive, by number and time in ms.
+/// The one number of an action, by the number of the action.
+type Numbered = fn(u64) -> f64;
+/// Numbers of actions, and when each arrives, ms.
 type Arrivals = &'static [(u64, u64)];
 
 /// An episode of a second, from 1000 ms on, of a sensor without fault, and of those actions that arrive.
-fn acted(folder: &Path, actions: Arrivals) -> EpisodeReport {
+fn acted(folder: &Path, actions: Arrivals, numbers: Numbered) -> EpisodeReport {
     let registry = with_actuator();
     let board = Arc::new(Board::new(&registry));
     let mut streams = Streams::new();
@@ -317,7 +319,12 @@ fn acted(folder: &Path, actions: Arrivals) -> EpisodeReport {
             streams.receive(Some(&mut open), TopicId::Modality(id(TOF)), &header, &[0; 16]);
         }
         for (number, _) in actions.iter().filter(|(_, at)| *at == ms) {
-            streams.receive(Some(&mut open), TopicId::Action, &scalars(*number, ms, ms), &[0; 8]);
+            streams.receive(
+                Some(&mut open),
+                TopicId::Action,
+                &scalars(*number, ms, ms),
+                &numbers(*number).to_le_bytes(),
+            );
         }
         open.advance(Stamp(ms * MS), &streams.masks);
     }
@@ -338,7 +345,7 @@ fn lost_actions_are_suspect_by_the_recorder_and_by_inspect_with_and_without_its_
     ];
     for (what, actions, lost) in table {
         let folder = tempfile::tempdir().unwrap();
-        let report = acted(folder.path(), actions);
+        let report = acted(folder.path(), actions, |_| 0.0);
         let within = actions.iter().filter(|(_, at)| (1000..2000).contains(at)).count();
         assert_eq!(read(&report.file).on(rapid_core::action::ACTION_TOPIC).count(), within, "{what}");
         let reasons: Vec<_> = lost
@@ -360,6 +367,24 @@ fn lost_actions_are_suspect_by_the_recorder_and_by_inspect_with_and_without_its_
         let mut of_actions = answer.verdict.reasons();
         of_actions.retain(|reason| reason.contains("action"));
         assert_eq!(of_actions, reasons, "{what}, killed");
+    }
+}
+
+#[test]
+fn actions_that_are_not_finite_are_suspect_by_the_recorder_and_by_inspect() {
+    const ACTIONS: Arrivals = &[(6, 990), (7, 1000), (8, 1100), (9, 1900)];
+    let table: [(Numbered, Option<&str>); 3] = [
+        (|number| number as f64, None),
+        (|number| if number == 6 { f64::NAN } else { 0.0 }, None),
+        (|number| if number < 9 { f64::NAN } else { 0.0 }, Some("2 actions")),
+    ];
+    for (numbers, reason) in table {
+        let folder = tempfile::tempdir().unwrap();
+        let report = acted(folder.path(), ACTIONS, numbers);
+        let reasons: Vec<_> =
+            reason.map(|count| format!("{count} with a number that is not finite (limit 0)")).into_iter().collect();
+        assert_eq!(report.verdict.reasons, reasons);
+        assert_eq!(inspect::inspect(&report.file).unwrap().verdict.verdict(), Some(&report.verdict));
     }
 }
 
@@ -387,4 +412,68 @@ fn an_episode_in_progress_is_judged_like_a_finished_one() {
     let lost = outlook.finding("tof").expect("a finding").sentence();
     assert!(lost.contains("lost by the device"), "{lost}");
     assert!(report.verdict.reasons.contains(&lost), "{:?}", report.verdict.reasons);
+}
+
+/// One picture of sixty, the rest whole: it is in the file, in no frame, and a reason; the recorder and `inspect` agree.
+#[test]
+fn a_picture_that_is_not_usable_is_in_no_frame_and_a_reason() {
+    use rapid_pictures::jpeg::{Values, encode};
+    let encoded = |[height, width]: [u16; 2], values| {
+        let mut jpeg = Vec::new();
+        encode(&vec![90; 3 * usize::from(height) * usize::from(width)], [height, width], values, 90, &mut jpeg)
+            .unwrap();
+        jpeg
+    };
+    let grain: Vec<u8> = (0..64_usize * 64).map(|at| u8::try_from(at * at % 251).unwrap()).collect();
+    let mut detailed = Vec::new();
+    encode(&grain, [64, 64], Values::Grey, 90, &mut detailed).unwrap();
+    let lost = [&detailed[..400], &detailed[500..]].concat();
+    let zeroed = [&detailed[..400], &[0; 100], &detailed[500..]].concat();
+    let whole = "";
+    let cut = "1 of 60 samples not whole pictures";
+    let other = "1 of 60 samples with a picture of another size or kind";
+    let cases: [(&str, Vec<u8>, &str); 8] = [
+        ("whole", detailed.clone(), whole),
+        ("bytes behind its end", [&detailed[..], b"\r\nseq=7"].concat(), whole),
+        ("bytes lost inside", lost, cut),
+        ("bytes of zeros inside", zeroed, cut),
+        ("without an end", detailed[..detailed.len() - 2].to_vec(), cut),
+        ("nothing but markers", b"\xff\xd8\xff\xd9".to_vec(), cut),
+        ("another size", encoded([32, 64], Values::Grey), other),
+        ("another kind", encoded([64, 64], Values::Rgb), other),
+    ];
+    for (name, payload, reason) in cases {
+        let folder = tempfile::tempdir().unwrap();
+        let board = Arc::new(Board::new(&registry()));
+        let mut masks = MaskHistory::new();
+        masks.push(&scalars(5, 996, 996), PhysicalMask(0b1), 5);
+        let mut open = open(folder.path(), &board, &masks);
+        for n in 0..60 {
+            let at = 1000 + n * 50;
+            let header = SampleHeader { encoding: Encoding::Mjpeg as u32, ..scalars(n, at, at + 5) };
+            let mut picture = if n == 30 { payload.clone() } else { detailed.clone() };
+            if n != 30 {
+                // Each differs from the one before, in bytes behind the picture.
+                picture.extend(n.to_le_bytes());
+            }
+            open.sample(id(CAM), &header, &picture, None);
+        }
+        let now = Stamp(4200 * MS);
+        open.end_at(Stamp(3990 * MS));
+        open.advance(now, &masks);
+        let report = open.finish(now, &masks, None, &[]);
+        let found = inspect::inspect(&report.file).unwrap();
+        assert_eq!(found.verdict.verdict(), Some(&report.verdict), "{name}");
+        let reasons: Vec<_> = report.verdict.reasons.iter().filter(|reason| reason.contains("samples")).collect();
+        match reason {
+            "" => assert!(reasons.is_empty(), "{name}: {reasons:?}"),
+            expected => assert!(reasons.iter().any(|reason| reason.contains(expected)), "{name}: {reasons:?}"),
+        }
+        let cam = found.modalities.iter().find(|modality| modality.bit == CAM).unwrap();
+        let quality = cam.quality.unwrap();
+        let damaged = u64::from(!reason.is_empty());
+        assert_eq!((quality.samples, quality.damaged), (60, damaged), "{name}");
+        // It was captured at a tick, whose window holds no other.
+        assert_eq!(cam.frames_stale, damaged, "{name}");
+    }
 }

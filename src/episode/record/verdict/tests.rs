@@ -81,6 +81,16 @@ fn every_check_has_its_text_and_its_two_limits() {
     );
     is(|q| (q.damaged, q.truncated) = (4, 4), Suspect, &["cam: 4 of 210 samples not whole pictures (limit 1 %)"]);
     is(
+        |q| (q.damaged, q.other_shape) = (4, 4),
+        Suspect,
+        &["cam: 4 of 210 samples with a picture of another size or kind (limit 1 %)"],
+    );
+    is(
+        |q| (q.damaged, q.truncated, q.other_shape) = (4, 2, 1),
+        Suspect,
+        &["cam: 4 of 210 samples damaged, 2 of them not whole pictures, 1 of another size or kind (limit 1 %)"],
+    );
+    is(
         |q| q.duplicates = 1,
         Suspect,
         &["cam: 1 of 210 samples with a non-increasing sequence number or capture time (limit 0.1 %)"],
@@ -234,7 +244,8 @@ fn a_plugged_device_that_never_runs_is_missed_and_one_that_starts_is_not() {
 fn the_file_and_its_losses_count_and_the_most_severe_reason_comes_first() {
     let quality = Quality { lost: 5, ..good() };
     let modalities = [Judged { name: "cam", quality: &quality, limits: limits() }];
-    let of = |file| Facts { missing: Missing { masks: 2, actions: 0, events: 1 }, ..facts(&modalities, file) };
+    let of =
+        |file| Facts { missing: Missing { masks: 2, events: 1, ..Missing::default() }, ..facts(&modalities, file) };
     let report = judge(&of(FileState::NotWhole("it was recovered")));
     let lost = "cam: 5 of 215 samples lost by the device (limit 1 %)";
     let missing = ["2 publications of the mask are not in the file (limit 0)", "1 event is not in the file (limit 0)"];

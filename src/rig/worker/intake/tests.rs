@@ -73,21 +73,76 @@ fn samples_that_match_the_entry_are_forwarded() {
     assert!(intake(ModalityKind::Bytes, &[]).judge(&header(Encoding::Bytes), b"", NOW).is_some());
 }
 
+/// What becomes of a capture time.
+#[derive(Debug, PartialEq)]
+enum Becomes {
+    /// The sample is good, with this stamp of the device's.
+    Good(u64),
+    /// The program does not know when; the sample is good, with the time of its arrival.
+    Arrival,
+    /// It is damaged, with this estimate.
+    Damaged(u64),
+}
+
 #[test]
-fn an_impossible_time_is_replaced() {
+fn an_impossible_time_is_damaged_and_decides_for_its_sample_alone() {
+    use Becomes::{Arrival, Damaged, Good};
+    const S: u64 = 1_000_000_000;
+    const MS: u64 = 1_000_000;
+    // Capture time, arrival, what it becomes, and whether it is complained about.
+    let table = [
+        (0, 100 * S, Arrival, false),
+        (101 * S, 102 * S, Good(101 * S), false),
+        // The far future; reported once. The one before took a second.
+        (u64::MAX, 103 * S, Damaged(102 * S), true),
+        (104 * S + 1, 104 * S, Damaged(103 * S), false),
+        // Long ago, and the origin of another clock.
+        (92 * S, 105 * S, Damaged(104 * S), false),
+        (1, 105 * S, Damaged(104 * S), false),
+        // The next one is as good as ever; also directly after an estimate that was too late.
+        (104 * S + 100 * MS, 105 * S + 100 * MS, Good(104 * S + 100 * MS), false),
+        (u64::MAX, 105 * S + 200 * MS, Damaged(104 * S + 200 * MS), false),
+        (104 * S + 190 * MS, 105 * S + 250 * MS, Good(104 * S + 200 * MS + 1), false),
+        // Back, before one that was believed.
+        (104 * S, 105 * S + 300 * MS, Damaged(104 * S + 240 * MS), false),
+        // As late as is believed, which is for the verdict.
+        (106 * S, 116 * S, Good(106 * S), false),
+        (106 * S + 1, 116 * S + 2, Damaged(106 * S + 2), false),
+    ];
     let mut intake = intake(ModalityKind::Bytes, &[]);
-    let mut captured = |capture_ns, now| {
+    for (capture_ns, now, expected, complains) in table {
         let header = SampleHeader { capture_ns, flags: FLAG_DEVICE_TIME, ..header(Encoding::Bytes) };
         let judged = intake.judge(&header, b"", Stamp(now)).expect("a sample");
-        (judged.captured.0, judged.flags & FLAG_DEVICE_TIME != 0, intake.complaint().is_some())
-    };
-    let s = 1_000_000_000;
-    assert_eq!(captured(0, 100 * s), (100 * s, false, false), "not known");
-    assert_eq!(captured(101 * s, 102 * s), (101 * s, true, false));
-    assert_eq!(captured(u64::MAX, 103 * s), (103 * s, false, true), "the far future");
-    assert_eq!(captured(104 * s + 1, 104 * s), (104 * s, false, false), "reported once");
-    assert_eq!(captured(1, 105 * s), (105 * s, false, false), "long ago");
-    assert_eq!(captured(104 * s, 106 * s), (105 * s, true, false), "never back");
+        let found = match judged.flags {
+            0 if judged.captured.0 == now => Arrival,
+            FLAG_DEVICE_TIME => Good(judged.captured.0),
+            FLAG_ERROR => Damaged(judged.captured.0),
+            other => panic!("{other}"),
+        };
+        assert_eq!(found, expected, "{capture_ns} at {now}");
+        let complaint = intake.complaint();
+        assert_eq!(complaint.is_some(), complains, "{complaint:?}");
+    }
+}
+
+#[test]
+fn a_capture_time_that_is_not_believed_is_named_with_the_fix() {
+    let fix = "send CLOCK_MONOTONIC, or 0 if it is not known";
+    let table = [
+        (NOW.0 + 2_500_000_000, "2.5s in the future"),
+        (NOW.0 - 12_000_000_000, "12s old"),
+        (NOW.0 - 1_005_000_000, "1s before the one before"),
+    ];
+    for (capture_ns, doubt) in table {
+        let mut intake = intake(ModalityKind::Bytes, &[]);
+        let mut judge = |capture_ns| {
+            intake.judge(&SampleHeader { capture_ns, ..header(Encoding::Bytes) }, b"", NOW).expect("a sample");
+            intake.complaint()
+        };
+        assert_eq!(judge(NOW.0 - 5_000_000), None);
+        let expected = format!("samples are damaged, by a capture time that is {doubt}: {fix}");
+        assert_eq!(judge(capture_ns), Some(expected));
+    }
 }
 
 #[test]
@@ -121,6 +176,9 @@ proptest! {
                 prop_assert!(judged.captured <= Stamp(now) && judged.lost <= LARGEST_HOLE);
                 prop_assert!(judged.width <= 4 && judged.height <= 2);
                 prop_assert_eq!(judged.flags & !3, 0);
+                // A later sample is never made an earlier one.
+                let is_damaged = judged.flags & FLAG_ERROR != 0;
+                prop_assert!(is_damaged || capture_ns == 0 || judged.captured == Stamp(capture_ns));
             }
         }
     }

@@ -159,3 +159,24 @@ proptest! {
         prop_assert_eq!(found, parts("f", 16, &stream.chunks(size).collect::<Vec<_>>()));
     }
 }
+
+proptest! {
+    #[test]
+    fn a_boundary_is_found_alike_however_its_line_arrives(
+        empty in prop::collection::vec(prop_oneof![Just("\r\n"), Just("\n")], 0..4),
+        dashes in 2_usize..5, name in "[a-z0-9]{1,60}", end in prop_oneof![Just("\r\n"), Just("\n")], rest in any::<Vec<u8>>(),
+    ) {
+        let line = format!("{}{}{name}{end}", empty.concat(), "-".repeat(dashes));
+        for cut in 0..line.len() {
+            prop_assert_eq!(sniff(&line.as_bytes()[..cut]), Sniffed::Open, "{}", cut);
+        }
+        let whole = [line.as_bytes(), &rest].concat();
+        prop_assert_eq!(sniff(&whole), Sniffed::Boundary(name));
+    }
+
+    #[test]
+    fn a_body_without_a_boundary_is_recognised_within_a_line(bytes in any::<Vec<u8>>(), more in any::<u8>()) {
+        let _ = sniff(&bytes);
+        prop_assert_ne!(sniff(&[more; 1 << 10]), Sniffed::Open);
+    }
+}
