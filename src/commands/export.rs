@@ -15,8 +15,8 @@ use rapid_core::text;
 use rapid_episode::record::inspect::{self, ReadError};
 use rapid_episode::sha256;
 use rapid_export::{
-    self, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, NotExported, Noted, Pictures, Position,
-    Refusal, SetError, Survey, Unfit, Verdicts, Verified,
+    self, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, NotExported, Pictures, Position, Refusal,
+    SetError, Survey, Unfit, Verdicts, Verified,
 };
 use rapid_registry::ExportSpec;
 use rapid_status::Grade;
@@ -215,17 +215,16 @@ pub fn export(
 }
 
 /// What people noted about these files.
-fn noted_of(files: &[PathBuf], report: &mut Report<'_>) -> io::Result<BTreeMap<PathBuf, Noted>> {
+fn noted_of(files: &[PathBuf], report: &mut Report<'_>) -> io::Result<BTreeMap<PathBuf, Notes>> {
     let mut warnings = Vec::new();
-    let all = noted(files, &mut |error| warnings.push(error.to_string()));
+    let noted = noted(files, &mut |error| warnings.push(format!("warning: {error}")));
     for warning in warnings {
-        writeln!(report.err, "{}", text::plain(&format!("warning: {warning}")))?;
+        writeln!(report.err, "{}", text::plain(&warning))?;
     }
-    let exported = |(file, Notes { label, label_reason, note, .. })| (file, Noted { label, label_reason, note });
-    Ok(all.into_iter().map(exported).collect())
+    Ok(noted)
 }
 
-fn has_label(args: &ExportArgs, noted: Option<&Noted>) -> bool {
+fn has_label(args: &ExportArgs, noted: Option<&Notes>) -> bool {
     args.label.is_empty() || args.label.contains(&LabelFilter::of(noted.and_then(|noted| noted.label)))
 }
 

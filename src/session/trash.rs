@@ -45,7 +45,10 @@ pub fn restore(folder: &Folder, name: &str) -> io::Result<()> {
 /// # Errors
 /// The first error; the other files are deleted nevertheless.
 pub fn empty<'a>(folder: &Folder, names: impl Iterator<Item = &'a str>) -> io::Result<()> {
+    let mut names = names.peekable();
     let trash = match folder.subfolder(TRASH, Missing::Refused).map_err(io::Error::from) {
+        // What is there in its place is not ours.
+        Err(_) if names.peek().is_none() => return Ok(()),
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
         opened => opened?,
     };
