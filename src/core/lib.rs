@@ -20,6 +20,7 @@ pub mod random;
 pub mod remote;
 pub mod rotation;
 pub mod sample;
+pub mod site;
 pub mod sync;
 pub mod text;
 pub mod time;

@@ -281,13 +281,14 @@ impl EpisodeReport {
             Some(_) if self.is_cut_short() => "cut short",
             Some(_) => "not whole",
         };
-        let sensors = verdict.sensors.as_ref().map(|sensors| format!(", {sensors}")).unwrap_or_default();
+        let remarks = Some(verdict.remarks()).filter(|remarks| !remarks.is_empty());
+        let remarks = remarks.map(|remarks| format!(", {remarks}")).unwrap_or_default();
         // If an error caused a reason, the reason includes the error.
         let why = if verdict.reasons.is_empty() { error.clone().unwrap_or_default() } else { verdict.why() };
         let why = if why.is_empty() { why } else { format!(": {why}") };
         let (word, file, size) = (verdict.grade.word(), file.display(), text::size(*bytes));
         let sentence = format!(
-            "{word} {file} {end}, {seconds:.1} s, {messages} messages, {size}, {dropped} dropped{sensors}{why}"
+            "{word} {file} {end}, {seconds:.1} s, {messages} messages, {size}, {dropped} dropped{remarks}{why}"
         );
         Description::new(level, "episode", word, sentence).without(&format!("{word} "))
     }
