@@ -21,8 +21,10 @@ use super::trash;
 
 /// The name of the file of a session in progress.
 const CURRENT: &str = "session.toml";
-/// A file of a million episodes is smaller; a larger one is not ours.
-const LARGEST: u64 = 1 << 28;
+/// A file of a hundred thousand episodes is smaller; a larger one is not ours.
+const LARGEST: u64 = 1 << 26;
+/// No episode is longer, in seconds: a year.
+const LONGEST: f64 = 366.0 * 86_400.0;
 /// For people who open it.
 const HEAD: &str = "# A session of rapid. Written at each change while it lasts; edit it only when it has ended.\n";
 
@@ -139,10 +141,18 @@ fn read(path: &Path) -> Result<SessionFile, JournalError> {
         let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
         invalid(format!("line {}: {}", before.matches('\n').count() + 1, error.message()))
     })?;
-    match file.episodes.iter().find(|episode| !trash::is_name(&episode.file)) {
-        Some(episode) => Err(invalid(format!("{:?} is not the name of an episode's file", episode.file))),
-        None => Ok(file),
+    if let Some(episode) = file.episodes.iter().find(|episode| !trash::is_name(&episode.file)) {
+        return Err(invalid(format!("{:?} is not the name of an episode's file", episode.file)));
     }
+    // Also false of what is not a number.
+    let is_length = |seconds: &f64| (0.0..=LONGEST).contains(seconds);
+    for episode in &file.episodes {
+        let mut lengths = episode.seconds.iter().chain(episode.marks.iter().map(|mark| &mark.at));
+        if let Some(wrong) = lengths.find(|seconds| !is_length(seconds)) {
+            return Err(invalid(format!("{}: {wrong} is not a length in seconds", episode.file)));
+        }
+    }
+    Ok(file)
 }
 
 /// Whether an episode is discarded, by what was noted and where files with its name are. The run may have been killed
@@ -415,6 +425,37 @@ mod tests {
         assert!(error.is_none(), "{error:?}");
         assert_eq!(read.unwrap(), file);
         insta::assert_snapshot!(std::fs::read_to_string(folder.path().join("session.toml")).unwrap());
+    }
+
+    #[test]
+    fn no_length_of_a_session_is_impossible_and_no_file_endless() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut journal, ..) = Journal::open(folder.path());
+        journal.save(&session(vec![entry("20261124_place-block_001.mcap")])).unwrap();
+        let path = folder.path().join("session.toml");
+        let written = std::fs::read_to_string(&path).unwrap();
+        for (was, key) in [("seconds = 29.8", "seconds"), ("at = 12.5", "at"), ("at = 13.0", "at")] {
+            assert!(written.contains(was), "{written}");
+            for number in ["inf", "-inf", "nan", "1e300", "-1.0", "1e18"] {
+                let text = written.replace(was, &format!("{key} = {number}"));
+                std::fs::write(&path, text).unwrap();
+                let (read, errors) = sessions(folder.path());
+                // What is shown of each.
+                for file in &read {
+                    crate::session::markdown(file);
+                }
+                let error = errors.first().map(ToString::to_string).unwrap_or_default();
+                assert!(error.contains("001.mcap: ") && error.contains("not a length in seconds"), "{number}: {error}");
+            }
+        }
+        for inside in ["[".repeat(500_000), "{a=".repeat(300_000), format!("1\n{}=1", "a.".repeat(400_000))] {
+            std::fs::write(&path, format!("begun = {inside}")).unwrap();
+            assert_eq!(sessions(folder.path()).1.len(), 1);
+        }
+        std::fs::write(&path, written).unwrap();
+        std::fs::File::options().write(true).open(&path).unwrap().set_len(1 << 40).unwrap();
+        let error = sessions(folder.path()).1.remove(0).to_string();
+        assert!(error.contains("larger than 67.1 MB"), "{error}");
     }
 
     #[test]

@@ -591,7 +591,7 @@ pub fn markdown(file: &SessionFile) -> String {
         page,
         "{}, {} in all: {} GOOD, {} SUSPECT, {} BAD{goal}. Begun {}.\n",
         text::counted(kept.len() as u64, "episode"),
-        text::about(Duration::from_secs_f64(seconds.max(0.0))),
+        text::about(Duration::try_from_secs_f64(seconds).unwrap_or_default()),
         of(Grade::Good),
         of(Grade::Suspect),
         of(Grade::Bad),
