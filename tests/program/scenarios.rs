@@ -364,6 +364,12 @@ fn number(payload: &[u8]) -> u32 {
     number
 }
 
+/// Whether it is a JPEG without its end: the one way in which the simulator damages pictures.
+fn is_cut(sample: &Message) -> bool {
+    let payload = sample.payload();
+    payload.starts_with(&[0xff, 0xd8]) && !payload.ends_with(&[0xff, 0xd9])
+}
+
 /// Rule 5.
 fn frames(run: &Run) {
     let duration = humantime::parse_duration(&run.expected.duration).expect("a duration");
@@ -400,6 +406,7 @@ fn frames(run: &Run) {
                 let named = samples[at].iter().find(|sample| u64::from(sample.sequence) == seq);
                 let named = named.unwrap_or_else(|| panic!("not in the file: {what}"));
                 assert!(named.log_time.abs_diff(tick) <= window, "{what}");
+                assert!(!is_cut(named), "not a whole picture: {what}");
                 let age = i128::from(tick) - i128::from(named.log_time);
                 assert_eq!(slot.age_ns.map(i128::from), Some(age), "{what}");
             }
@@ -407,7 +414,7 @@ fn frames(run: &Run) {
                 let nearest = samples[at]
                     .iter()
                     .filter(|sample| sample.publish_time.max(sample.log_time) <= message.publish_time)
-                    .filter(|sample| sample.log_time.abs_diff(tick) <= window)
+                    .filter(|sample| sample.log_time.abs_diff(tick) <= window && !is_cut(sample))
                     .min_by_key(|sample| (sample.log_time.abs_diff(tick), sample.log_time, sample.sequence));
                 let nearest = nearest.map(|sample| u64::from(sample.sequence));
                 assert_eq!(slot.seq.filter(|_| slot.valid), nearest, "{what}");
@@ -510,6 +517,17 @@ fn verdict(run: &Run) {
         assert_eq!(read, counted[&modality.name], "{}: inspect counts the same", modality.name);
     }
 
+    // Whoever has a sample and was not present in between is named, with the time.
+    let edges = run.episode.mask_edges();
+    let is_away = |bit: u8| edges.iter().any(|(_, mask)| mask & (1 << bit) == 0);
+    let sensors = verdict.sensors.as_ref().expect("those of the registry");
+    let named: BTreeSet<&str> = sensors.away.iter().map(|absence| absence.name.as_str()).collect();
+    let away = modalities.iter().filter(|modality| modality.topic.messages > 0 && is_away(modality.bit));
+    assert_eq!(named, away.map(|modality| modality.name.as_str()).collect());
+    assert!(sensors.away.iter().all(|absence| absence.seconds > 0.0 && absence.seconds < absence.of), "{sensors}");
+    let sentence = ended["sensors"]["away"].as_array().map_or(0, Vec::len);
+    assert_eq!(sentence, named.len(), "the end of the episode names them, too");
+
     let expected = &run.expected.reasons;
     for begins in expected {
         assert!(reasons.iter().any(|reason| reason.starts_with(begins)), "{begins:?} in {reasons:?}");
@@ -551,4 +569,6 @@ scenarios! {
     a_frozen_camera
     damaged_lost_and_twice
     late_and_fast
+    away_and_expected
+    another_unit_takes_over
 }

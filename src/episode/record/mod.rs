@@ -21,6 +21,7 @@ mod provenance;
 mod publishers;
 mod quality;
 mod recorder;
+mod sources;
 mod space;
 pub mod stepped;
 mod streams;
@@ -61,6 +62,17 @@ pub enum RecordError {
     /// The folder lies behind another user's link, or cannot be entered.
     #[error("{0}, or choose another with --out")]
     Folder(rapid_system::folder::FolderError),
+    /// The folder was moved while a session is collected in it.
+    #[error(
+        "{}: this folder was moved to {} during the session: move it back, or end this run and begin another with --out {}",
+        from.display(), to.display(), to.display()
+    )]
+    Moved {
+        /// Its path.
+        from: PathBuf,
+        /// Where it is now.
+        to: PathBuf,
+    },
     /// There is not enough disk space for an episode.
     #[error(
         "{}: the disk is full: {} free, and an episode needs more than {}, which are kept free (disk_reserve under \

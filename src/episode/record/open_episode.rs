@@ -379,6 +379,7 @@ impl OpenEpisode {
         let dropped = self.measures.dropped();
         let qualities = qualities(&self.registry, &self.measures, end);
         let judged = judged(&qualities);
+        let epochs = self.units.epochs(self.begin);
         let facts = Facts {
             modalities: &judged,
             missing: self.missing,
@@ -388,6 +389,7 @@ impl OpenEpisode {
             losses: Losses::Apart,
             file: reason.as_deref().map_or(FileState::Whole, FileState::NotWhole),
             findings: &[],
+            epochs: &epochs,
         };
         let whole = judge(&facts);
         let ending = Ending {
@@ -439,6 +441,7 @@ impl OpenEpisode {
             losses: Losses::Apart,
             file: FileState::Whole,
             findings: &[],
+            epochs: &self.units.epochs(self.begin),
         };
         self.outlook = Outlook { findings: findings(&facts) };
     }

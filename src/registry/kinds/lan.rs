@@ -377,8 +377,8 @@ impl Kind for LanSpec {
             // Its samples report its state once a second, and are not observations: its pictures are in the clip.
             (limits.suspect.valid, limits.bad.valid) = (None, None);
         }
-        if self.is_remote() {
-            *limits = limits.of_another_computer(sync_window);
+        if self.is_remote() || matches!(self.protocol, LanProtocol::Iphone { .. }) {
+            *limits = limits.of_another_clock(sync_window);
         }
     }
 
