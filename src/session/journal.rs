@@ -26,8 +26,8 @@ use super::trash;
 
 /// The name of the file of a session in progress.
 const CURRENT: &str = "session.toml";
-/// A file of a million episodes is smaller; a larger one is not ours.
-const LARGEST: u64 = 1 << 28;
+/// A file of a hundred thousand episodes is smaller; a larger one is not ours.
+const LARGEST: u64 = 1 << 26;
 /// For people who open it.
 const HEAD: &str = "# A session of rapid. Written at each change while it lasts; edit it only when it has ended.\n";
 
@@ -605,6 +605,37 @@ mod tests {
         assert!(error.is_none(), "{error:?}");
         assert_eq!(read.unwrap(), file);
         insta::assert_snapshot!(std::fs::read_to_string(folder.path().join("session.toml")).unwrap());
+    }
+
+    #[test]
+    fn no_length_of_a_session_is_impossible_and_no_file_endless() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut journal, ..) = Journal::open(folder.path(), "place block");
+        journal.save(&session(vec![entry("20261124_place-block_001.mcap")])).unwrap();
+        let path = folder.path().join("session.toml");
+        let written = std::fs::read_to_string(&path).unwrap();
+        for (was, key) in [("seconds = 29.8", "seconds"), ("at = 12.5", "at"), ("at = 13.0", "at")] {
+            assert!(written.contains(was), "{written}");
+            for number in ["inf", "-inf", "nan", "1e300", "-1.0", "1e18"] {
+                let text = written.replace(was, &format!("{key} = {number}"));
+                std::fs::write(&path, text).unwrap();
+                let (read, errors) = sessions(folder.path());
+                // What is shown of each.
+                for file in &read {
+                    crate::session::markdown(file);
+                }
+                let error = errors.first().map(ToString::to_string).unwrap_or_default();
+                assert!(error.contains(": line ") && error.contains("no time in seconds"), "{number}: {error}");
+            }
+        }
+        for inside in ["[".repeat(500_000), "{a=".repeat(300_000), format!("1\n{}=1", "a.".repeat(400_000))] {
+            std::fs::write(&path, format!("begun = {inside}")).unwrap();
+            assert_eq!(sessions(folder.path()).1.len(), 1);
+        }
+        std::fs::write(&path, written).unwrap();
+        std::fs::File::options().write(true).open(&path).unwrap().set_len(1 << 40).unwrap();
+        let error = sessions(folder.path()).1.remove(0).to_string();
+        assert!(error.contains("larger than 67.1 MB"), "{error}");
     }
 
     #[test]
