@@ -35,6 +35,7 @@ mod list;
 mod many_devices;
 mod modules;
 mod nodes;
+mod notes;
 mod observe;
 mod old_files;
 mod plot;
