@@ -69,8 +69,15 @@ impl Row {
         } else {
             format!("{}: {}", self.notes.label.map_or("label", Label::word), self.notes.label_reason)
         };
+        let verdict = self.listed.verdict.verdict();
+        let away = verdict.and_then(|verdict| verdict.sensors.as_ref()).map_or(&[][..], |sensors| &sensors.away);
+        let away: Vec<String> = away.iter().map(ToString::to_string).collect();
+        let replays =
+            verdict.map_or(&[][..], |verdict| &verdict.replay_of).iter().map(|file| format!("replay of {file}"));
+        // The reason names it already.
+        let replays: Vec<String> = replays.filter(|replay| !first.starts_with(replay.as_str())).collect();
         let tags: Vec<String> = self.listed.tags.iter().map(|(key, value)| format!("{key}={value}")).collect();
-        let parts = [&tags.join(" "), first, &more, &label, &self.notes.note];
+        let parts = [&tags.join(" "), first, &more, &replays.join(", "), &away.join(", "), &label, &self.notes.note];
         let parts: Vec<&str> = parts.into_iter().filter(|part| !part.is_empty()).collect();
         text::plain(&parts.join("; ")).into_owned()
     }
@@ -195,7 +202,7 @@ fn line(row: &Row, name: &str, zone: &Zone, palette: Palette) -> String {
     let begun = if *begin_ns > 0 { zone.minute(*begin_ns) } else { String::new() };
     let label = row.notes.label.map_or("", Label::word);
     let sensors = verdict.verdict().and_then(|verdict| verdict.sensors.as_ref());
-    let sensors = sensors.map(|sensors| format!("{}/{}", sensors.recorded, sensors.registered)).unwrap_or_default();
+    let sensors = sensors.map(|sensors| format!("{}/{}", sensors.throughout(), sensors.registered)).unwrap_or_default();
     let seconds = if row.listed.error.is_none() { format!("{seconds:.1} s") } else { String::new() };
     let size = if row.listed.error.is_none() { text::size(*bytes) } else { String::new() };
     let line = format!(

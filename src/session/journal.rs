@@ -533,7 +533,7 @@ mod tests {
             discarded: false,
             marks: vec![Mark { at: 12.5, text: String::new() }, Mark { at: 13.0, text: "grasp".to_owned() }],
             task: "place block".to_owned(),
-            sensors: Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()] }),
+            sensors: Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()], away: Vec::new() }),
         }
     }
 

@@ -21,6 +21,8 @@ mod ends;
 mod export;
 #[cfg(feature = "foxglove")]
 mod foxglove;
+#[cfg(feature = "foxglove")]
+mod foxglove_hostile;
 mod hooks;
 mod hostile;
 mod infer;

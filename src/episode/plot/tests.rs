@@ -79,7 +79,7 @@ fn the_picture_is_bounded_and_escaped_whatever_is_in_the_file() {
     report.task = HOSTILE.repeat(10_000);
     report.tags = (0..1000).map(|tag| (format!("{tag}{HOSTILE}"), HOSTILE.to_owned())).collect();
     let reasons = vec![HOSTILE.repeat(1000); 10_000];
-    report.verdict = Judgement::Episode(Verdict { grade: Grade::Bad, reasons, sensors: None });
+    report.verdict = Judgement::Episode(Verdict { grade: Grade::Bad, reasons, sensors: None, replay_of: Vec::new() });
     report.modalities = (0..64).map(flapping).collect();
     report.mask = (0..10_000).map(|at| MaskEdge { at: f64::from(at) * 0.36, mask: HOSTILE.to_owned() }).collect();
     let noted = Notes {

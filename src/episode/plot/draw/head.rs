@@ -68,7 +68,7 @@ fn facts(report: &Inspection) -> String {
         FileEnd::Unfinished | FileEnd::Torn => Some("not finished"),
         FileEnd::Damaged => Some("damaged"),
     };
-    let sensors = report.verdict.verdict().map(rapid_status::Verdict::sensors).filter(|words| !words.is_empty());
+    let sensors = report.verdict.verdict().map(rapid_status::Verdict::remarks).filter(|words| !words.is_empty());
     let begun = (report.begin_ns > 0).then(|| rfc3339(report.begin_ns).replace('T', " "));
     let begun = begun.map(|begun| format!("{} UTC", begun.split('.').next().unwrap_or_default()));
     let messages = text::counted(report.messages, "message");
