@@ -86,6 +86,13 @@ impl SessionFile {
             let is_here = folder.has(&episode.file);
             let is_in_trash = trash::holds(folder, &episode.file);
             episode.discarded = was_discarded(episode.discarded, is_here, is_in_trash);
+        }
+        self.take_notes(folder);
+    }
+
+    /// Takes over what is noted beside its episodes: other programs may have noted it.
+    fn take_notes(&mut self, folder: &Folder) {
+        for episode in &mut self.episodes {
             match notes::read(folder, episode.file.as_ref()) {
                 Ok(Some(notes)) => episode.set_notes(notes),
                 Ok(None) => {}
@@ -378,6 +385,7 @@ impl Journal {
     /// # Errors
     /// When the disk does not accept it.
     pub fn summarise(&mut self, file: &SessionFile) -> Result<(), JournalError> {
+        let mut file = file.clone();
         let name = format!("session-{}.md", compact(&file.begun));
         let path = self.path.join(&name);
         let io = |source| JournalError::Io { path, source };
@@ -385,7 +393,8 @@ impl Journal {
             Ok(folder) => folder,
             Err(error) => return Err(io(error.into())),
         };
-        folder.replace_by_umask(&name, super::markdown(file).as_bytes(), Sync::Wait).map_err(io)
+        file.take_notes(folder);
+        folder.replace_by_umask(&name, super::markdown(&file).as_bytes(), Sync::Wait).map_err(io)
     }
 
     /// Gives the file, which is saved, its final contents and name, and writes the summary.
@@ -411,8 +420,10 @@ impl Journal {
 
     fn write_final(&self, file: &SessionFile) -> Result<(), JournalError> {
         let io = |source| JournalError::Io { path: self.path.join(&self.name), source };
-        let text = toml::to_string(file).map_err(|error| io(io::Error::other(error)))?;
         let folder = self.folder.as_ref().ok_or_else(|| io(io::ErrorKind::NotFound.into()))?;
+        let mut file = file.clone();
+        file.take_notes(folder);
+        let text = toml::to_string(&file).map_err(|error| io(io::Error::other(error)))?;
         folder.replace_by_umask(&self.name, format!("{HEAD}{text}").as_bytes(), Sync::Wait).map_err(io)?;
         let _ = folder.sync();
         Ok(())
