@@ -211,5 +211,10 @@ fn report(board: &Board, level: Level, text: &str) {
 
 /// The verdict on an episode that was never recorded.
 fn pretended() -> rapid_status::Verdict {
-    rapid_status::Verdict { grade: rapid_status::Grade::Good, reasons: Vec::new(), sensors: None }
+    rapid_status::Verdict {
+        grade: rapid_status::Grade::Good,
+        reasons: Vec::new(),
+        sensors: None,
+        replay_of: Vec::new(),
+    }
 }

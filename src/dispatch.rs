@@ -93,6 +93,8 @@ pub fn refuse(error: &clap::Error) -> ExitCode {
 /// Runs a command line.
 pub fn dispatch(cli: Cli) -> ExitCode {
     let (json, command) = (cli.global.json, cli.name.clone());
+    // Without it, too, the command does what it can.
+    let _ = app::signals::outlive_large_files();
     match check_built(&cli).and_then(|()| execute(cli)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure { text, code }) => {
@@ -184,7 +186,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
         }
         Command::List(args) => {
             let palette = Palette::for_output(&io::stdout());
-            reported(commands::list::list(&args, format, palette, out, &|error| {
+            reported(commands::list::list(&args, format, palette, out, &mut |error| {
                 print_warning(&format_args!("labels and notes are missing: {error}"));
             })?)
         }

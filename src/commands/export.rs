@@ -5,8 +5,7 @@
 //!
 //! Invariant: an episode that cannot be exported is named with the reason, and the others are exported nevertheless.
 
-use std::cell::RefCell;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -16,18 +15,18 @@ use rapid_core::text;
 use rapid_episode::record::inspect::{self, ReadError};
 use rapid_episode::sha256;
 use rapid_export::{
-    self, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, NotExported, Noted, Pictures, Position,
-    Refusal, SetError, Survey, Unfit, Verdicts, Verified,
+    self, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, NotExported, Pictures, Position, Refusal,
+    SetError, Survey, Unfit, Verdicts, Verified,
 };
 use rapid_registry::ExportSpec;
 use rapid_status::Grade;
-use rapid_status::session::EpisodeEntry;
+use rapid_status::session::Notes;
 use serde::{Serialize, Serializer};
 
-use super::list::noted;
 use super::progress::Work;
 use super::{Format, json_line};
 use crate::cli::{ExportArgs, LabelFilter, PictureForm, VerdictArg};
+use crate::session::noted::noted;
 
 /// Why the export ended.
 #[derive(Debug, thiserror::Error)]
@@ -216,21 +215,16 @@ pub fn export(
 }
 
 /// What people noted about these files.
-fn noted_of(files: &[PathBuf], report: &mut Report<'_>) -> io::Result<BTreeMap<PathBuf, Noted>> {
-    let folders: BTreeSet<&Path> = files.iter().filter_map(|file| file.parent()).collect();
-    let warnings = RefCell::new(Vec::new());
-    let entries = noted(&folders, &|error| warnings.borrow_mut().push(error.to_string()));
-    for warning in warnings.into_inner() {
-        writeln!(report.err, "{}", text::plain(&format!("warning: {warning}")))?;
+fn noted_of(files: &[PathBuf], report: &mut Report<'_>) -> io::Result<BTreeMap<PathBuf, Notes>> {
+    let mut warnings = Vec::new();
+    let noted = noted(files, &mut |error| warnings.push(format!("warning: {error}")));
+    for warning in warnings {
+        writeln!(report.err, "{}", text::plain(&warning))?;
     }
-    let noted = |(file, entry): (PathBuf, EpisodeEntry)| {
-        let EpisodeEntry { label, label_reason, note, .. } = entry;
-        (file, Noted { label, label_reason, note })
-    };
-    Ok(entries.into_iter().map(noted).collect())
+    Ok(noted)
 }
 
-fn has_label(args: &ExportArgs, noted: Option<&Noted>) -> bool {
+fn has_label(args: &ExportArgs, noted: Option<&Notes>) -> bool {
     args.label.is_empty() || args.label.contains(&LabelFilter::of(noted.and_then(|noted| noted.label)))
 }
 

@@ -8,6 +8,7 @@
 
 pub mod action;
 pub mod bell;
+pub mod capture;
 pub mod interlock;
 pub mod mask;
 pub mod modality;

@@ -6,8 +6,9 @@
 //! they do not report is absent.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// A driver of the kernel.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize)]
@@ -72,6 +73,29 @@ pub struct Negotiated {
     pub format: Option<Format>,
     /// Controls and their values as read back, by their names in `devices.toml`.
     pub controls: BTreeMap<String, i64>,
+    /// Its samples are those of a recording.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub replay_of: Option<Arc<ReplaySource>>,
+}
+
+/// A recording that is replayed.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct ReplaySource {
+    /// Its file.
+    pub file: String,
+    /// When it began, ns since 1970.
+    pub begin_ns: u64,
+    /// The word of its verdict; empty if it has none.
+    pub verdict: String,
+    /// Why it is not GOOD, or has no verdict.
+    pub reasons: Vec<String>,
+}
+
+impl ReplaySource {
+    /// The name of its file, without the folder.
+    pub fn name(&self) -> &str {
+        self.file.rsplit('/').next().unwrap_or_default()
+    }
 }
 
 /// The format of the samples of a device.

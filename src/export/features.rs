@@ -516,8 +516,9 @@ impl Known {
 #[cfg(test)]
 mod tests {
     use rapid_status::Grade;
+    use rapid_status::session::Notes;
 
-    use super::super::survey::{Noted, Stream};
+    use super::super::survey::Stream;
     use super::*;
 
     fn features() -> Features {
@@ -582,7 +583,7 @@ mod tests {
             bytes: 0,
             sha256: String::new(),
             grade: Grade::Good,
-            noted: Noted::default(),
+            noted: Notes::default(),
             rows: 1,
             unusable: 0,
             unfit: Vec::new(),

@@ -39,7 +39,7 @@ pub use ffmpeg::{Ffmpeg, FfmpegError};
 pub use picture::{Codec, Pictures};
 pub use rows::{Refusal, Unfit};
 pub use set::{DataSet, Prepared, prepare};
-pub use survey::{Noted, Survey, Verdicts, survey};
+pub use survey::{Survey, Verdicts, survey};
 pub use table::Position;
 pub use verify::{Difference, Verified, verify};
 pub use video::{Encoded, Ends, encode};

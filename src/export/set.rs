@@ -11,6 +11,7 @@
 //! Invariant: files get their names in this order when they are complete, so that a set whose writer was killed has all
 //! its earlier episodes, or all and the last one.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -24,7 +25,7 @@ use arrow_array::{Array, ArrayRef, Float64Array, Int64Array, RecordBatch, String
 use arrow_schema::{ArrowError, DataType, Field, Schema};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use rapid_episode::sha256;
-use rapid_status::session::Label;
+use rapid_status::session::{Label, Notes};
 use rapid_system::folder::{Folder, Links, Missing};
 use rustix::fs::FlockOperation;
 use serde_json::{Map, Value, json};
@@ -37,7 +38,7 @@ use super::owned;
 use super::picture::Pictures;
 use super::rows::{Index, Refusal};
 use super::statistics::Column;
-use super::survey::{Noted, Survey};
+use super::survey::Survey;
 use super::table::{Position, Table, one_row, timestamp};
 use super::video::{Damaged, Encoded};
 
@@ -52,6 +53,7 @@ const VERDICT: &str = "rapid/verdict";
 const LABEL: &str = "rapid/label";
 const LABEL_REASON: &str = "rapid/label_reason";
 const NOTE: &str = "rapid/note";
+const MARKS: &str = "rapid/marks";
 /// As pandas names an index without a name.
 const TASK: &str = "__index_level_0__";
 
@@ -65,7 +67,7 @@ pub(super) struct Entry {
     pub(super) task: u64,
     statistics: Statistics,
     /// `None` of an earlier version, which did not keep it.
-    noted: Option<Noted>,
+    noted: Option<Notes>,
 }
 
 /// By feature, a column of it after the other.
@@ -171,14 +173,14 @@ impl DataSet {
         // LeRobot loads facts only if all of them have the same columns.
         let earlier = |(number, entry): (usize, &Entry)| entry.noted.is_none().then_some(number);
         let earlier: Vec<usize> = self.entries.iter().enumerate().filter_map(earlier).collect();
-        earlier.into_iter().try_for_each(|number| self.note(number, &Noted::default()))
+        earlier.into_iter().try_for_each(|number| self.note(number, &Notes::default()))
     }
 
     /// Notes what people noted about an episode that is there already.
     ///
     /// # Errors
     /// When its facts cannot be written.
-    pub fn note(&mut self, number: usize, noted: &Noted) -> Result<(), SetError> {
+    pub fn note(&mut self, number: usize, noted: &Notes) -> Result<(), SetError> {
         let path = self.entry_path(number as u64);
         let Some(entry) = self.entries.get_mut(number).filter(|entry| entry.noted.as_ref() != Some(noted)) else {
             return Ok(());
@@ -187,7 +189,7 @@ impl DataSet {
         let batch = one_row(&path).map_err(wrong)?;
         let batch =
             batch.ok_or_else(|| SetError::Foreign { path: path.clone(), problem: "not of one row".to_owned() })?;
-        let texts = noted.texts();
+        let texts = texts(noted);
         let mut row = OneRow::default();
         for (field, column) in batch.schema().fields().iter().zip(batch.columns()) {
             if texts.iter().all(|(key, _)| field.name() != key) {
@@ -403,7 +405,7 @@ impl DataSet {
             }
         }
         row.texts([(SOURCE, &*entry.source), (SHA256, &*entry.sha256), (VERDICT, episode.grade.word())]);
-        row.texts(episode.noted.texts());
+        row.texts(texts(&episode.noted));
         for feature in features.all() {
             let key = feature.key;
             let columns = entry.statistics.get(&key).map_or(&[][..], Vec::as_slice);
@@ -492,18 +494,22 @@ impl DataSet {
     }
 }
 
-impl Noted {
-    fn texts(&self) -> [(&'static str, &str); 3] {
-        let label = self.label.map(Label::word).unwrap_or_default();
-        [(LABEL, label), (LABEL_REASON, &*self.label_reason), (NOTE, &*self.note)]
-    }
+/// What people noted, as texts; the marks as JSON.
+fn texts(notes: &Notes) -> [(&'static str, Cow<'_, str>); 4] {
+    let label = notes.label.map(Label::word).unwrap_or_default();
+    let marks = if notes.marks.is_empty() { String::new() } else { json!(notes.marks).to_string() };
+    let own = [(LABEL, label), (LABEL_REASON, &*notes.label_reason), (NOTE, &*notes.note)];
+    let [label, reason, note] = own.map(|(key, text)| (key, Cow::Borrowed(text)));
+    [label, reason, note, (MARKS, Cow::Owned(marks))]
 }
 
 /// What is in an episode's facts; `None` if a text of it is missing.
-fn noted(text: &dyn Fn(&str) -> Option<String>) -> Option<Noted> {
+fn noted(text: &dyn Fn(&str) -> Option<String>) -> Option<Notes> {
     let word = text(LABEL)?;
     let label = [Label::Success, Label::Failure].into_iter().find(|label| label.word() == word);
-    Some(Noted { label, label_reason: text(LABEL_REASON)?, note: text(NOTE)? })
+    let marks = text(MARKS)?;
+    let marks = if marks.is_empty() { Vec::new() } else { serde_json::from_str(&marks).ok()? };
+    Some(Notes { label, label_reason: text(LABEL_REASON)?, note: text(NOTE)?, marks })
 }
 
 fn data_path(folder: &Path, episode: u64) -> PathBuf {
@@ -625,9 +631,9 @@ impl OneRow {
         self.push(key, Arc::new(Int64Array::from(vec![i64::try_from(value).unwrap_or(i64::MAX)])));
     }
 
-    fn texts<'t>(&mut self, texts: impl IntoIterator<Item = (&'static str, &'t str)>) {
+    fn texts(&mut self, texts: impl IntoIterator<Item = (&'static str, impl AsRef<str>)>) {
         for (key, text) in texts {
-            self.push(key, Arc::new(StringArray::from(vec![text])));
+            self.push(key, Arc::new(StringArray::from(vec![text.as_ref()])));
         }
     }
 

@@ -10,7 +10,7 @@ use rapid_episode::record::inspect::{self, Inspection, Judgement};
 use rapid_episode::record_iter::FileEnd;
 use rapid_pictures::pixels::{CHANNELS, Picture, Pixels};
 use rapid_registry::{ExportSpec, Form, Registry};
-use rapid_status::session::Label;
+use rapid_status::session::Notes;
 use rapid_status::{Grade, Verdict};
 
 use super::picture::{self, Shape};
@@ -33,17 +33,6 @@ pub enum Verdicts<'a> {
     Only(&'a [Grade]),
 }
 
-/// What people noted about an episode.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct Noted {
-    /// Whether the demonstration succeeded.
-    pub label: Option<Label>,
-    /// Why it has this label; empty without.
-    pub label_reason: String,
-    /// Empty without.
-    pub note: String,
-}
-
 /// An episode that can be exported.
 #[derive(Debug)]
 pub struct Survey {
@@ -56,7 +45,7 @@ pub struct Survey {
     /// The verdict on it.
     pub grade: Grade,
     /// What people noted about it; nothing until it is set.
-    pub noted: Noted,
+    pub noted: Notes,
     /// Rows it becomes.
     pub rows: usize,
     /// Samples that belong to a row and cannot be used: damaged pictures, numbers that are not finite. Their rows are
@@ -141,7 +130,7 @@ pub fn survey(path: &Path, sha256: String, verdicts: Verdicts<'_>, stop: &Atomic
         bytes: inspection.bytes,
         sha256,
         grade,
-        noted: Noted::default(),
+        noted: Notes::default(),
         rows,
         unusable,
         unfit,

@@ -20,6 +20,7 @@ use rapid_episode::{sha256, text_map};
 use rapid_pictures::pixels::{Picture, Pixels};
 use rapid_registry::ExportSpec;
 use rapid_status::Grade;
+use rapid_status::session::Notes;
 
 use super::cells::CellMaker;
 use super::error::SetError;
@@ -28,7 +29,7 @@ use super::picture::{Codec, Pictures, Shape};
 use super::rows::{Form, Index, Listed, Refusal, Row};
 use super::set::{DataSet, prepare};
 use super::statistics::Column;
-use super::survey::{Content, Noted, Stream, Survey, Verdicts, survey};
+use super::survey::{Content, Stream, Survey, Verdicts, survey};
 use super::table::{Position, Rows, Table};
 use super::verify::verify;
 use super::video::{Encoded, FrameMaker, Shown};
@@ -189,7 +190,7 @@ fn surveyed(path: &Path, task: &str) -> Survey {
         bytes: 0,
         sha256: sha256(path).unwrap(),
         grade: Grade::Good,
-        noted: Noted::default(),
+        noted: Notes::default(),
         rows: index.ticks.len(),
         unusable: 0,
         unfit: Vec::new(),

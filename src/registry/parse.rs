@@ -171,7 +171,7 @@ fn registry(root: &Section<'_>, programs: Programs<'_>, file: &str) -> Result<Re
     let export = root.table("export").map(|section| export::read(&section, &drafts)).unwrap_or_default();
     root.check()?;
 
-    let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict, rig.sync_window)).collect();
+    let mut devices: Vec<_> = drafts.into_iter().filter_map(|draft| draft.finish(&verdict, &rig)).collect();
     devices.sort_by_key(|(_, device)| device.id);
     warn_of_narrow_window(&devices, rig.sync_window);
     kinds::can::warn_of_slow_stop(&devices);

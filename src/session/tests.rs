@@ -80,6 +80,7 @@ impl Owner {
                     self.carry_out(effects);
                 }
                 Effect::Mark(_) => assert!(self.recording.is_some()),
+                Effect::Note(file, ..) => assert_ne!(self.recording.as_ref(), Some(&file), "it has no name yet"),
                 Effect::Close(_) if self.stuck => self.session.closed(false, "t1".to_owned()),
                 Effect::Close(gone) => {
                     for file in gone {
@@ -97,7 +98,7 @@ impl Owner {
         let Some(file) = self.recording.take() else { return };
         self.ending = false;
         self.files.insert(file.clone());
-        let verdict = Verdict { grade, reasons: Vec::new(), sensors: None };
+        let verdict = Verdict { grade, reasons: Vec::new(), sensors: None, replay_of: Vec::new() };
         let effects = self.session.ended(Path::new(&file), 1.0, &verdict, self.now);
         self.carry_out(effects);
     }
@@ -315,7 +316,8 @@ fn an_episode_of_a_killed_run_counts_once_it_is_known_what_became_of_it() {
     let nothing = again.examined("002.mcap", None);
     assert_eq!((nothing, again.counted()), (vec![Effect::Save], 1));
     assert!(markdown(again.file()).contains("| 002.mcap |  | not closed |  |  | nothing of it was recorded |"));
-    let verdict = Verdict { grade: Grade::Suspect, reasons: vec!["cut off".to_owned()], sensors: None };
+    let verdict =
+        Verdict { grade: Grade::Suspect, reasons: vec!["cut off".to_owned()], sensors: None, replay_of: Vec::new() };
     again.examined("002.mcap", Some((1.5, &verdict)));
     assert!(again.is_complete() && again.unfinished().is_empty());
     assert_eq!(again.examined("001.mcap", None), [], "it is closed");

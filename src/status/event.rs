@@ -167,7 +167,7 @@ pub enum EventKind {
     },
     /// The policy ended.
     PolicyEnd(PolicyEnd),
-    /// The clock of the computer that a device is on, twice a second while its samples arrive.
+    /// The clock of a phone, or of the computer that a device is on, twice a second while its samples arrive.
     Clock {
         /// Modality.
         device: String,
@@ -281,13 +281,14 @@ impl EpisodeReport {
             Some(_) if self.is_cut_short() => "cut short",
             Some(_) => "not whole",
         };
-        let sensors = verdict.sensors.as_ref().map(|sensors| format!(", {sensors}")).unwrap_or_default();
+        let remarks = Some(verdict.remarks()).filter(|remarks| !remarks.is_empty());
+        let remarks = remarks.map(|remarks| format!(", {remarks}")).unwrap_or_default();
         // If an error caused a reason, the reason includes the error.
         let why = if verdict.reasons.is_empty() { error.clone().unwrap_or_default() } else { verdict.why() };
         let why = if why.is_empty() { why } else { format!(": {why}") };
         let (word, file, size) = (verdict.grade.word(), file.display(), text::size(*bytes));
         let sentence = format!(
-            "{word} {file} {end}, {seconds:.1} s, {messages} messages, {size}, {dropped} dropped{sensors}{why}"
+            "{word} {file} {end}, {seconds:.1} s, {messages} messages, {size}, {dropped} dropped{remarks}{why}"
         );
         Description::new(level, "episode", word, sentence).without(&format!("{word} "))
     }
@@ -414,7 +415,7 @@ impl EventKind {
             }
             Self::Clock { device, bit, offset_ns, uncertainty_ns } => {
                 let (offset, within) = (*offset_ns as f64 / 1e9, *uncertainty_ns as f64 / 1e6);
-                let rest = format!("of its computer is {offset:+.6} s from this one, within {within:.3} ms");
+                let rest = format!("of the device is {offset:+.6} s from this one, within {within:.3} ms");
                 D::joined(Level::Debug, device, "clock", " ", &rest).with_bit(*bit)
             }
             Self::Actuator { device, bit, arming, is_problem, text } => {

@@ -406,7 +406,7 @@ words! {
 
 /// The verdict on one episode. As JSON:
 /// `{"verdict":"SUSPECT","reasons":["..."],"sensors":{"registered":3,"recorded":2,"without":["tactile_tip"]}}`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Verdict {
     /// The word.
     #[serde(rename = "verdict")]
@@ -414,8 +414,11 @@ pub struct Verdict {
     /// Why it is not GOOD, the most severe first: sentences for people, each with modality, figure and limit. Empty if
     /// and only if it is GOOD.
     pub reasons: Vec<String>,
-    /// Which sensors took part; unknown (`null`) if the file does not state which were registered.
+    /// Which sensors took part, and which of them not all the time; unknown (`null`) if the file does not state which were registered.
     pub sensors: Option<Sensors>,
+    /// The names of the files that were replayed, if its samples come from recordings.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub replay_of: Vec<String>,
 }
 
 impl Verdict {
@@ -429,14 +432,16 @@ impl Verdict {
         (self.grade, &self.reasons) == (other.grade, &other.reasons)
     }
 
-    /// `2 of 3 sensors, without tactile_tip`; empty if unknown.
-    pub fn sensors(&self) -> String {
-        self.sensors.as_ref().map(ToString::to_string).unwrap_or_default()
+    /// `1 of 3 sensors, without gel, tactile_tip away 18.0 s of 31.0 s`, before it `replay of a.mcap` if it is one; empty
+    /// if nothing is known.
+    pub fn remarks(&self) -> String {
+        let replays = self.replay_of.iter().map(|file| format!("replay of {file}"));
+        replays.chain(self.sensors.as_ref().map(ToString::to_string)).collect::<Vec<_>>().join(", ")
     }
 }
 
-/// How many of the registered sensors have a sample in an episode.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+/// How many of the registered sensors took part in an episode.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Sensors {
     /// Entries of the registry.
     pub registered: usize,
@@ -444,13 +449,53 @@ pub struct Sensors {
     pub recorded: usize,
     /// The names of the others, in the order of their bits.
     pub without: Vec<String>,
+    /// Those with a sample that were not present all the time, in the order of their bits.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub away: Vec<Absence>,
+}
+
+/// A sensor that was not present in a part of an episode, by the mask.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Absence {
+    /// Its name.
+    pub name: String,
+    /// How long it was not present in all, seconds, to the millisecond.
+    pub seconds: f64,
+    /// Length of the episode, seconds, likewise.
+    pub of: f64,
+}
+
+impl Sensors {
+    /// How many were present all the time.
+    pub const fn throughout(&self) -> usize {
+        self.recorded.saturating_sub(self.away.len())
+    }
+
+    /// `1 of 3 sensors, without gel`: those that were present all the time are counted.
+    pub fn counted(&self) -> String {
+        let Self { registered, without, .. } = self;
+        let throughout = self.throughout();
+        let sensors = if *registered == 1 { "sensor" } else { "sensors" };
+        let without = if without.is_empty() { String::new() } else { format!(", without {}", without.join(", ")) };
+        format!("{throughout} of {registered} {sensors}{without}")
+    }
 }
 
 impl std::fmt::Display for Sensors {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { registered, recorded, without } = self;
-        write!(f, "{recorded} of {registered} sensor{}", if *registered == 1 { "" } else { "s" })?;
-        if without.is_empty() { Ok(()) } else { write!(f, ", without {}", without.join(", ")) }
+        f.write_str(&self.counted())?;
+        self.away.iter().try_for_each(|absence| write!(f, ", {absence}"))
+    }
+}
+
+impl std::fmt::Display for Absence {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { name, seconds, of } = self;
+        if *seconds < 1.0 {
+            write!(f, "{name} away {:.0} ms of {of:.1} s", seconds * 1e3)
+        } else {
+            write!(f, "{name} away {seconds:.1} s of {of:.1} s")
+        }
     }
 }
 

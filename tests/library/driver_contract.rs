@@ -211,7 +211,12 @@ async fn a_recording_loses_nothing_when_reads_are_dropped() {
     }
     writer.finish().unwrap();
     std::fs::write(file.path(), writer.into_inner().into_inner()).unwrap();
-    let source = SimSource::Replay { file: file.path().to_owned(), topic: "/t".into(), begin_ns: 1_000_000_000 };
+    let source = SimSource::Replay {
+        file: file.path().to_owned(),
+        topic: "/t".into(),
+        begin_ns: 1_000_000_000,
+        of: Arc::default(),
+    };
     let (mut driver, device) = open_sim(source).await;
     let found = read_interrupted(&mut driver, 200).await;
     for (i, bytes) in found.iter().enumerate() {

@@ -467,7 +467,7 @@ fn label_and_verdict_select_and_labels_and_notes_are_in_the_dataset() {
     // An episode of an earlier version, whose facts have no labels: LeRobot loads only facts of one form.
     let facts = place.path("set/meta/episodes/chunk-000/file-001.parquet");
     let batch = rows(&place, "set/meta/episodes/chunk-000/file-001.parquet").remove(0);
-    let keys = ["rapid/label", "rapid/label_reason", "rapid/note"];
+    let keys = ["rapid/label", "rapid/label_reason", "rapid/note", "rapid/marks"];
     let schema = batch.schema();
     let kept: Vec<usize> =
         (0..batch.num_columns()).filter(|at| !keys.contains(&schema.field(*at).name().as_str())).collect();
@@ -477,14 +477,16 @@ fn label_and_verdict_select_and_labels_and_notes_are_in_the_dataset() {
             .expect("Parquet");
     writer.write(&earlier).and_then(|()| writer.close()).expect("written");
     assert_eq!(fact(&place, 1, "rapid/label"), None);
-    // A label that was changed after the export is in the dataset too.
+    // A label that was changed after the export is in the dataset too, and what is noted beside an episode.
+    let beside = "label = \"failure\"\n[[marks]]\nat = 0.5\ntext = \"grasped\"\n";
+    place.write(&format!("out/{unlabelled}.toml"), beside);
     place.write("out/session.toml", &[begin, noted("failure", success), noted("failure", failure)].concat());
     assert_eq!(selected(&[]), (vec![failure.clone(), unlabelled.clone()], Some(0), 0));
     let facts = |episode| keys.map(|key| fact(&place, episode, key).expect("a text"));
-    assert_eq!(facts(0), ["failure", "slipped", "new pads"]);
-    assert_eq!(facts(1), ["", "", ""]);
-    assert_eq!(facts(2), ["failure", "slipped", "new pads"]);
-    assert_eq!(facts(3), ["", "", ""]);
+    assert_eq!(facts(0), ["failure", "slipped", "new pads", ""]);
+    assert_eq!(facts(1), ["", "", "", ""]);
+    assert_eq!(facts(2), ["failure", "slipped", "new pads", ""]);
+    assert_eq!(facts(3), ["failure", "", "", r#"[{"at":0.5,"text":"grasped"}]"#]);
 
     let none = place.run(&["export", "out", "--to", "lerobot", "--out", "none", "--label", "success"]);
     let text = String::from_utf8_lossy(&none.stderr).into_owned();

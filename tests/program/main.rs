@@ -52,6 +52,7 @@ mod screen;
 mod scripts;
 mod second_run;
 mod session;
+mod sessions;
 mod shared_memory;
 mod skips;
 mod stops;

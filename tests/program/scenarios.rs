@@ -517,6 +517,17 @@ fn verdict(run: &Run) {
         assert_eq!(read, counted[&modality.name], "{}: inspect counts the same", modality.name);
     }
 
+    // Whoever has a sample and was not present in between is named, with the time.
+    let edges = run.episode.mask_edges();
+    let is_away = |bit: u8| edges.iter().any(|(_, mask)| mask & (1 << bit) == 0);
+    let sensors = verdict.sensors.as_ref().expect("those of the registry");
+    let named: BTreeSet<&str> = sensors.away.iter().map(|absence| absence.name.as_str()).collect();
+    let away = modalities.iter().filter(|modality| modality.topic.messages > 0 && is_away(modality.bit));
+    assert_eq!(named, away.map(|modality| modality.name.as_str()).collect());
+    assert!(sensors.away.iter().all(|absence| absence.seconds > 0.0 && absence.seconds < absence.of), "{sensors}");
+    let sentence = ended["sensors"]["away"].as_array().map_or(0, Vec::len);
+    assert_eq!(sentence, named.len(), "the end of the episode names them, too");
+
     let expected = &run.expected.reasons;
     for begins in expected {
         assert!(reasons.iter().any(|reason| reason.starts_with(begins)), "{begins:?} in {reasons:?}");
@@ -558,4 +569,6 @@ scenarios! {
     a_frozen_camera
     damaged_lost_and_twice
     late_and_fast
+    away_and_expected
+    another_unit_takes_over
 }

@@ -54,6 +54,12 @@ fn a_replay_recorded_again_holds_the_same_samples_at_the_same_intervals() {
     let scenario = place.write("pulled.toml", PULLED).display().to_string();
     let file = record(&place, "first", &["--sim", &scenario], 1000);
     let original = Episode::read(&place.path(&file));
+    for (command, words) in
+        [("list", "  2/3  "), ("list", "tactile_tip away "), ("inspect", "   2 of 3 sensors\n  tactile_tip away ")]
+    {
+        let shown = String::from_utf8_lossy(&place.run(&[command, &file]).stdout).into_owned();
+        assert!(shown.contains(words) && !shown.contains("3 of 3"), "{command}: {words:?} in {shown}");
+    }
     // It ends before that recording does: its devices stay silent then.
     let file = record(&place, "second", &["replay", &file], 250);
     let again = Episode::read(&place.path(&file));
@@ -135,4 +141,45 @@ fn after_a_kill_the_next_run_takes_over_and_leaves_nothing_of_the_dead_one() {
         !files.iter().any(|file| file.ends_with(".mcap.partial")),
         "the killed run's file is looked after: {files:?}"
     );
+}
+
+/// A line that loses every twentieth sample.
+const GAPPY: &str = "[[device]]\nname = \"cam_wrist\"\n[[device]]\nname = \"tactile_tip\"\n[[device]]\n\
+    name = \"motor_state\"\n[device.fault]\nlose_every = 10\n";
+
+/// A recording that was made of nothing real is as bad as what was replayed: its samples are numbered anew, without the
+/// losses.
+#[test]
+fn a_recording_of_a_replay_says_so_everywhere_and_keeps_the_verdict_of_its_source() {
+    let place = Place::new();
+    let scenario = place.write("gappy.toml", GAPPY).display().to_string();
+    let common = ["--headless", "--json", "--record", "--duration", "3s", "--out"];
+    place.run(&[&["--sim", &scenario][..], &common, &["first"]].concat());
+    let source = place.files("first").remove(0);
+    let shown = place.run(&[&["replay", &format!("first/{source}")][..], &common, &["second"]].concat());
+    assert_eq!(shown.status.code(), Some(4), "{}", String::from_utf8_lossy(&shown.stderr));
+    let reason = format!("replay of {source}, which is BAD: motor_state: ");
+    let ended = events(&String::from_utf8_lossy(&shown.stdout)).into_iter().find(|event| event["event"] == "episode");
+    let ended = ended.expect("an episode");
+    assert_eq!((&ended["verdict"], &ended["replay_of"][0]), (&"BAD".into(), &source.as_str().into()));
+    assert!(ended["reasons"][0].as_str().is_some_and(|first| first.starts_with(&reason)), "{ended}");
+
+    let again = place.files("second").remove(0);
+    let episode = Episode::read(&place.path("second").join(&again));
+    for record in ["rapid", "rapid/summary"] {
+        let stated: serde_json::Value = serde_json::from_str(episode.value(record, "replay_of")).expect("JSON");
+        assert_eq!((&stated[0]["verdict"], stated.as_array().map(Vec::len)), (&"BAD".into(), Some(1)), "{record}");
+        assert!(stated[0]["file"].as_str().is_some_and(|file| file.ends_with(&source)), "{stated}");
+    }
+    let said = |arguments: &[&str]| String::from_utf8_lossy(&place.run(arguments).stdout).into_owned();
+    for (arguments, words) in [
+        (&["list", "second"][..], format!("BAD      {again}")),
+        (&["list", "second"], format!("  3/3           {reason}")),
+        (&["inspect", "first", "second"], format!("  replay of {source}, 3 of 3 sensors  {reason}")),
+        (&["inspect", &format!("second/{again}")], format!("\n  replay of {source}\n")),
+        (&["--json", "inspect", &format!("second/{again}")], format!("\"replay_of\":[\"{source}\"]")),
+    ] {
+        let text = said(arguments);
+        assert!(text.contains(&words), "{arguments:?}: {words:?} in {text}");
+    }
 }

@@ -17,12 +17,13 @@ use std::time::Duration;
 
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::ModalityId;
-use rapid_core::provenance::{KernelDriver, Negotiated};
+use rapid_core::provenance::{KernelDriver, Negotiated, ReplaySource};
 use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
 use rapid_core::time::{Stamp, nanoseconds};
 use rapid_episode::MAGIC;
 use rapid_episode::decode::{Content, Kind, Sample, Scratch};
 use rapid_episode::reader::{Channel, Item, Reader};
+use rapid_episode::record::inspect::inspect;
 use rapid_episode::record_iter::FileEnd;
 use rapid_episode::{ReadAt, ReadError};
 use rapid_registry::device::{LanIdentity, UsbIdentity};
@@ -79,7 +80,7 @@ impl Replay {
     /// # Errors
     /// When the file cannot be read, has no such topic, or the topic holds no samples.
     pub async fn open(device: Arc<SimDevice>) -> Result<Self, DriverError> {
-        let SimSource::Replay { file, topic, begin_ns } = device.source.clone() else {
+        let SimSource::Replay { file, topic, begin_ns, of } = device.source.clone() else {
             return Err(DriverError::Fatal(format!("{} is not a recording", device.name)));
         };
         let elapsed = stamp_of(Instant::now()).since(device.begun);
@@ -92,7 +93,8 @@ impl Replay {
         // In a recording of the replay the file represents the device.
         let version = Some(env!("CARGO_PKG_VERSION").to_owned());
         let driver = Some(KernelDriver { name: "rapid-replay".to_owned(), version });
-        let negotiated = Negotiated { driver, bus: Some(description.clone()), ..Negotiated::default() };
+        let negotiated =
+            Negotiated { driver, bus: Some(description.clone()), replay_of: Some(of), ..Negotiated::default() };
         let agreed = Agreed { description, negotiated };
         Ok(Self { device, playing: Vec::new(), next: 0, reading, begin_ns, agreed })
     }
@@ -434,11 +436,17 @@ pub fn scenario(file: &Path) -> Result<Replayed, DriverError> {
     let loaded = Registry::parse(&episode.registry, None)
         .map_err(|errors| fatal(file, format!("the registry in it cannot be read: {errors}")))?;
     let registry = loaded.registry;
+    let of = Arc::new(source(file, episode.begin_ns)?);
     let device = |spec: &DeviceSpec| ScenarioDevice {
         name: spec.name.clone(),
         usb: usb_identity(spec),
         lan: lan_identity(spec),
-        source: SimSource::Replay { file: file.to_owned(), topic: spec.topic.clone(), begin_ns: episode.begin_ns },
+        source: SimSource::Replay {
+            file: file.to_owned(),
+            topic: spec.topic.clone(),
+            begin_ns: episode.begin_ns,
+            of: Arc::clone(&of),
+        },
         plugged: episode.mask.first().is_some_and(|(_, mask)| mask.contains(spec.id)),
         faults: SimFaults::default(),
     };
@@ -448,6 +456,14 @@ pub fn scenario(file: &Path) -> Result<Replayed, DriverError> {
     let devices = registry.devices.iter().map(device).collect();
     let length = Duration::from_nanos(episode.end_ns.saturating_sub(episode.begin_ns));
     Ok(Replayed { registry, scenario: Scenario { devices, events, repeat: None }, length })
+}
+
+/// What a recording of the replay states about the episode: a replay is no better than what is replayed.
+fn source(file: &Path, begin_ns: u64) -> Result<ReplaySource, DriverError> {
+    let judgement = inspect(file)?.verdict;
+    let verdict = judgement.grade().map_or(String::new(), |grade| grade.word().to_owned());
+    let reasons = judgement.reasons().into_iter().map(str::to_owned).collect();
+    Ok(ReplaySource { file: file.display().to_string(), begin_ns, verdict, reasons })
 }
 
 /// Plugs and unplugs of one modality, from the changes of its bit.

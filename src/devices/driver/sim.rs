@@ -334,7 +334,8 @@ impl Sim {
             SimSource::Replay { .. } | SimSource::Process => None,
         };
         let bus = Some(format!("sim:{}", self.device.name));
-        Negotiated { driver: Some(simulation::driver()), card: None, bus, format, controls: self.controls.clone() }
+        let driver = Some(simulation::driver());
+        Negotiated { driver, bus, format, controls: self.controls.clone(), ..Negotiated::default() }
     }
 }
 

@@ -13,6 +13,7 @@ use serde_json::{Map, Value, json};
 use super::provenance::Units;
 use super::publishers;
 use super::quality::{Quality, Spread};
+use super::sources::{self, REPLAY_OF};
 use super::verdict::Facts;
 use crate::{BOOT_ID, text_map};
 
@@ -27,7 +28,8 @@ pub(super) const POLICY: &str = "policy";
 /// JSON: `layout` `{name: bit}`, `modalities` `[{name, bit, topic, kind, shape, when_stale,
 /// latency_ns}]`, `serials` `{name: serial or null}` of what was attached when the episode began,
 /// `provenance` (see [`Units::epochs`]) of what ran then, `tags` `{key: value}`, `policy` `{name, hash,
-/// dry_run}` of the policy at the controls, absent if none was. `boot_id` is the boot of this machine (proc(5)).
+/// dry_run}` of the policy at the controls, absent if none was; `replay_of` `[{file, begin_ns, verdict, reasons}]` of
+/// the recordings that were replayed, absent if none was. `boot_id` is the boot of this machine (proc(5)).
 ///
 /// A message's `log_time` is its capture time as the kernel gave it. The latency is taken off when
 /// a frame's samples are chosen: a sample stands for the moment `log_time - latency_ns`.
@@ -65,7 +67,7 @@ pub(super) fn beginning(
         ("layout", Value::Object(layout).to_string()),
         ("modalities", Value::Array(modalities).to_string()),
         ("serials", units.serials().to_string()),
-        ("provenance", units.epochs(begin).to_string()),
+        ("provenance", json!(units.epochs(begin)).to_string()),
         ("commit", option_env!("RAPID_COMMIT").unwrap_or_default().to_owned()),
         ("kernel", host.release().to_string_lossy().into_owned()),
         ("host", host.nodename().to_string_lossy().into_owned()),
@@ -77,6 +79,7 @@ pub(super) fn beginning(
         ("wall_minus_monotonic_ns", clock.wall_ns(Stamp(0)).to_string()),
     ]);
     report.extend(units.policy().map(|policy| (POLICY.to_owned(), policy.to_string())));
+    report.extend(replay_of(units, begin));
     // A repair trusts what was written last only where the kernel that wrote it still runs.
     report.extend(crate::boot_id().map(|id| (BOOT_ID.to_owned(), id)));
     report
@@ -108,7 +111,7 @@ pub(super) struct Ending<'a> {
 /// `{registered, recorded, without}`; `modalities`
 /// `{name: {samples, bytes, lost, dropped, damaged, ...}}`, the fields of [`Quality`]; `skew_ms` `{p50,
 /// p95, p99, max}` between the earliest and the latest sample of a frame, or null; `serials` and
-/// `provenance` as at the beginning, of whatever was attached or ran at some time; `policy` likewise;
+/// `provenance` as at the beginning, of whatever was attached or ran at some time; `policy` and `replay_of` likewise;
 /// `publishers` `[{topic, process, command, samples}]` of other programs that published on our topics, absent if none did.
 pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
     let Facts { modalities, missing, publishers, seconds, .. } = *ending.facts;
@@ -133,13 +136,20 @@ pub(super) fn end(ending: &Ending<'_>) -> BTreeMap<String, String> {
         ("modalities", Value::Object(reports).to_string()),
         ("skew_ms", json!(ending.skew).to_string()),
         ("serials", ending.units.serials().to_string()),
-        ("provenance", ending.units.epochs(ending.begin).to_string()),
+        ("provenance", json!(ending.units.epochs(ending.begin)).to_string()),
     ]);
     report.extend(ending.units.policy().map(|policy| (POLICY.to_owned(), policy.to_string())));
+    report.extend(replay_of(ending.units, ending.begin));
     let others = (!publishers.is_empty()).then(|| json!(publishers).to_string());
     report.extend(others.map(|others| (publishers::KEY.to_owned(), others)));
     report.extend(ending.cut_short.map(|reason| (CUT_SHORT.to_owned(), reason.to_owned())));
     report
+}
+
+/// The recordings that were replayed.
+fn replay_of(units: &Units, begin: Stamp) -> Option<(String, String)> {
+    let replayed = sources::replayed(&units.epochs(begin));
+    (!replayed.is_empty()).then(|| (REPLAY_OF.to_owned(), json!(replayed).to_string()))
 }
 
 /// The configuration an episode is recorded with: modules, tags, and the sensors that were present. As JSON the value of

@@ -12,6 +12,8 @@ use rapid_status::{DeviceState, Event, EventKind, Provenance};
 use serde::Serialize;
 use serde_json::{Value, json};
 
+use super::sources::Epochs;
+
 /// Serial of every device attached, by its modality's name.
 type Serials = BTreeMap<String, Option<String>>;
 
@@ -108,7 +110,7 @@ impl Units {
     /// `{modality: [epoch, ...]}` in the order of time: each the event `opened` without its
     /// modality, with `from_s` and `to_s` in seconds from `begin`: negative for one that ran before
     /// the episode, null for one that did not end in it.
-    pub(super) fn epochs(&self, begin: Stamp) -> Value {
+    pub(super) fn epochs(&self, begin: Stamp) -> Epochs {
         let seconds = |at: Stamp| at.since(begin).as_secs_f64() - begin.since(at).as_secs_f64();
         let one = |epoch: &Incarnation| {
             let mut report = json!(epoch.provenance);
@@ -119,7 +121,7 @@ impl Units {
             report
         };
         let all = self.epochs.iter();
-        all.map(|(device, epochs)| (device.clone(), epochs.iter().map(one).collect::<Value>())).collect()
+        all.map(|(device, epochs)| (device.clone(), epochs.iter().map(one).collect())).collect()
     }
 }
 
@@ -199,8 +201,6 @@ mod tests {
         }
         let epochs = units.epochs(BEGIN);
         let report: Vec<_> = epochs["cam"]
-            .as_array()
-            .unwrap()
             .iter()
             .map(|e| (e["epoch"].as_u64(), e["serial"].as_str(), e["from_s"].as_f64(), e["to_s"].as_f64()))
             .collect();
@@ -260,6 +260,6 @@ mod tests {
             attached.apply(&event);
         }
         let units = Units::new(&attached);
-        assert_eq!((units.epochs(BEGIN), units.serials()), (json!({}), json!({"cam": "A"})));
+        assert_eq!((units.epochs(BEGIN), units.serials()), (Epochs::new(), json!({"cam": "A"})));
     }
 }

@@ -9,8 +9,11 @@
 //!    could not be measured has its own finding.
 //! 5. An episode in which another program published on one of our topics is SUSPECT.
 //! 6. An episode shorter than [`SHORTEST`] is BAD: too short for a demonstration.
-//! 7. An episode without a sample of a modality listed in `expect` is SUSPECT.
-//! 8. If one fault fails two checks, only the more specific one is reported: a frozen camera also repeats its pictures,
+//! 7. A modality listed in `expect` is judged by its share of the episode; one without a sample has none. With that check
+//!    off, such an episode is SUSPECT.
+//! 8. A replay is no better than the recording that was replayed; an episode in which another unit of the model took over
+//!    is SUSPECT.
+//! 9. If one fault fails two checks, only the more specific one is reported: a frozen camera also repeats its pictures,
 //!    a silent one also has a low rate.
 //!
 //! Invariant: pure.
@@ -22,10 +25,11 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_registry::{Limits, VerdictSpec};
-use rapid_status::{Finding, Grade, Sensors, Verdict};
+use rapid_status::{Absence, Finding, Grade, Sensors, Verdict};
 
 use super::publishers::Publisher;
 use super::quality::Quality;
+use super::sources::{self, Epochs};
 
 /// A modality with its limits.
 #[derive(Debug, Clone)]
@@ -83,6 +87,8 @@ pub(super) struct Facts<'a> {
     pub(super) file: FileState<'a>,
     /// Further reasons for SUSPECT, found outside this module.
     pub(super) findings: &'a [String],
+    /// What its samples come from.
+    pub(super) epochs: &'a Epochs,
 }
 
 /// With fewer expected samples, or less time, the rate is not judged.
@@ -107,8 +113,19 @@ pub(super) fn judge(facts: &Facts<'_>) -> Verdict {
         .map(|judged| judged.name.to_owned())
         .collect();
     let registered = facts.modalities.len();
-    let sensors = Sensors { registered, recorded: registered - without.len(), without };
-    Verdict { grade, reasons: found.iter().map(Finding::sentence).collect(), sensors: Some(sensors) }
+    let away = facts.modalities.iter().filter_map(|judged| away(judged, facts.seconds)).collect();
+    let sensors = Sensors { registered, recorded: registered - without.len(), without, away };
+    let reasons = found.iter().map(Finding::sentence).collect();
+    let replay_of = sources::replayed(facts.epochs).iter().map(|replayed| replayed.name().to_owned()).collect();
+    Verdict { grade, reasons, sensors: Some(sensors), replay_of }
+}
+
+/// How long a modality with a sample was away, if it was.
+fn away(judged: &Judged<'_>, length: f64) -> Option<Absence> {
+    let presence = judged.quality.presence.filter(|_| judged.quality.samples > 0)?;
+    let to_ms = |seconds: f64| (seconds * 1e3).round() / 1e3;
+    let seconds = to_ms((1.0 - presence) * length);
+    (seconds > 0.0).then(|| Absence { name: judged.name.to_owned(), seconds, of: to_ms(length) })
 }
 
 /// Every failed check, the most severe first.
@@ -121,15 +138,21 @@ pub(super) fn findings(facts: &Facts<'_>) -> Vec<Finding> {
         FileState::Failed(why) => found.push(of_all(Grade::Bad, format!("the file could not be written: {why}"))),
     }
     found.extend(facts.findings.iter().map(|finding| of_all(Grade::Suspect, finding.clone())));
+    let of_sources = sources::reasons(facts.epochs, facts.seconds).into_iter();
+    found.extend(of_sources.map(|(grade, text)| of_all(grade, text)));
     if is_short(facts.seconds) {
         let limit = seconds(SHORTEST.as_secs_f64());
         found.push(of_all(Grade::Bad, format!("too short: {} (limit {limit})", seconds(facts.seconds))));
     }
     for judged in facts.modalities {
         let mut of_it = modality(judged, facts);
-        // The finding is more exact.
-        if of_it.is_empty() && judged.quality.samples == 0 && facts.expect.iter().any(|name| name == judged.name) {
-            of_it.push((Grade::Suspect, "took no part, and is expected (expect under [rig])".to_owned()));
+        if judged.quality.samples == 0 && facts.expect.iter().any(|name| name == judged.name) {
+            let never = Quality { presence: Some(0.0), ..*judged.quality };
+            let grade = present(&never, &judged.limits, facts.seconds).map_or(Grade::Suspect, |(grade, _)| grade);
+            // Another finding is more exact, unless it is less severe.
+            if of_it.iter().all(|(found, _)| *found < grade) {
+                of_it.push((grade, "took no part, and is expected (expect under [rig])".to_owned()));
+            }
         }
         let modality = || Some(judged.name.to_owned());
         found.extend(of_it.into_iter().map(|(grade, text)| Finding { grade, modality: modality(), text }));
@@ -205,6 +228,7 @@ fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
     let rate = rate(quality, limits).filter(|rate| unless(rate, [&gap, &lost, &dropped]));
     let valid =
         valid(quality, limits).filter(|valid| unless(valid, [&gap, &lost, &dropped, &damaged, &late, &opening, &rate]));
+    let present = present(quality, limits, facts.seconds).filter(|present| unless(present, [&opening]));
     [
         dropped,
         lost,
@@ -219,6 +243,7 @@ fn modality(judged: &Judged<'_>, facts: &Facts<'_>) -> Vec<(Grade, String)> {
         uncertain(quality, limits),
         rate,
         valid,
+        present,
     ]
     .into_iter()
     .flatten()
@@ -266,7 +291,7 @@ fn clock(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {
 fn uncertain(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {
     let uncertainty = quality.clock_uncertainty? / 1e3;
     let (grade, limit) = longer(limits, |limits| limits.uncertain, uncertainty)?;
-    let text = format!("the clock of its computer was known to {} only (limit {limit})", seconds(uncertainty));
+    let text = format!("capture times uncertain by ±{} (limit {limit})", seconds(uncertainty));
     Some((grade, text))
 }
 
@@ -289,6 +314,14 @@ fn valid(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {
         grade,
         format!("{valid} of {ticks} ticks have a valid sample while present (limit {limit}; see sync_window)"),
     ))
+}
+
+fn present(quality: &Quality, limits: &VerdictSpec, length: f64) -> Option<(Grade, String)> {
+    let presence = quality.presence?;
+    let (grade, limit) = exceeded(limits, |limits| limits.present.filter(|limit| presence < *limit))?;
+    let (away, length) = (seconds((1.0 - presence) * length), seconds(length));
+    let share = (presence * 100.0).floor();
+    Some((grade, format!("away {away} of {length}: present for {share} % (limit {})", percent(limit))))
 }
 
 /// The more severe grade whose limit `exceeds` reports, and the limit.

@@ -378,7 +378,7 @@ impl Kind for LanSpec {
             (limits.suspect.valid, limits.bad.valid) = (None, None);
         }
         if self.is_remote() || matches!(self.protocol, LanProtocol::Iphone { .. }) {
-            *limits = limits.of_another_computer(sync_window);
+            *limits = limits.of_another_clock(sync_window);
         }
     }
 

@@ -22,7 +22,7 @@ use crate::section::Section;
 use crate::spec::VerdictSpec;
 use crate::spec::{
     ActionSpec, CameraSpec, CanProtocol, CanSpec, DeviceSpec, Form, Hooks, IdentitySpec, LanSpec, Mount, NodeSpec,
-    Opens, PixelFormat,
+    Opens, PixelFormat, RigSpec,
 };
 
 /// Keys that state which device an entry identifies.
@@ -181,13 +181,16 @@ impl<'d> Draft<'d> {
     }
 
     /// The entry, with the settings of `[verdict]` and `[rig]`; `None` only if a problem with it was reported.
-    pub(super) fn finish(self, rig: &VerdictTable, sync_window: Duration) -> Option<(Section<'d>, DeviceSpec)> {
+    pub(super) fn finish(self, limits: &VerdictTable, rig: &RigSpec) -> Option<(Section<'d>, DeviceSpec)> {
         let node = self.node?;
         let fps = node.picture().map(|picture| f64::from(picture.fps));
         let mut usual = VerdictSpec::defaults(node.modality_kind(), self.stall_after, fps);
-        node.of_kind().judge(&mut usual, sync_window);
+        node.of_kind().judge(&mut usual, rig.sync_window);
+        if rig.expect.contains(&self.name) {
+            usual = usual.of_an_expected_sensor();
+        }
         let spec = DeviceSpec {
-            verdict: verdict::changed(usual, rig, &self.verdict),
+            verdict: verdict::changed(usual, limits, &self.verdict),
             name: self.name,
             id: self.id?,
             identity: self.identity?,

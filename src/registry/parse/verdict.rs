@@ -36,6 +36,8 @@ keys! {
         rate = SHARE, usually "90 %, 50 %";
         /// Least share of the ticks while the device was attached that have a sample of it in `sync_window`.
         valid = SHARE, usually "90 %, 50 %";
+        /// Least share of the episode in which the device was present.
+        present = SHARE, usually "90 %, 50 % of what `expect` names; others off";
         /// Longest time in which every sample is byte-identical to the one before.
         frozen = TIME, usually "500 ms, 2 s of pictures; others off";
         /// Longest time without a sample while the device was attached.
@@ -44,7 +46,7 @@ keys! {
         opening = TIME, usually "5 s, off";
         /// Change of the stamps against this machine's clock over the episode.
         clock = TIME, usually "10 ms, 100 ms";
-        /// How far the capture times of a device of another computer may be wrong.
+        /// How far the capture times of a device with a clock of its own, a phone or another computer, may be wrong.
         uncertain = TIME, usually "half of `sync_window`, off; others off";
     }
 }
@@ -73,7 +75,7 @@ type Share = fn(&mut Limits) -> &mut Option<f64>;
 type Moment = fn(&mut Limits) -> &mut Option<Duration>;
 
 /// The first of the limits: those that are a share, and whether more of it is worse.
-const SHARES: [(Share, Worse); 8] = [
+const SHARES: [(Share, Worse); 9] = [
     (|limits| &mut limits.lost, Worse::More),
     (|limits| &mut limits.dropped, Worse::More),
     (|limits| &mut limits.damaged, Worse::More),
@@ -82,6 +84,7 @@ const SHARES: [(Share, Worse); 8] = [
     (|limits| &mut limits.late, Worse::More),
     (|limits| &mut limits.rate, Worse::Less),
     (|limits| &mut limits.valid, Worse::Less),
+    (|limits| &mut limits.present, Worse::Less),
 ];
 /// The others: those that are a time; longer is worse.
 const TIMES: [Moment; 5] = [
@@ -167,7 +170,7 @@ fn time(section: &Section<'_>, key: &str) -> Option<Given<Duration>> {
 
 /// `"0.1%"`, `"0.1 %"`, or `"off"`.
 fn share(section: &Section<'_>, key: &str) -> Option<Given<f64>> {
-    let usual = if ["rate", "valid"].contains(&key) { "90%" } else { "0.5%" };
+    let usual = if ["rate", "valid", "present"].contains(&key) { "90%" } else { "0.5%" };
     let fix = format!("write 0% to 100%, or \"off\", for example {key} = \"{usual}\"");
     if !section.has(key) {
         return None;

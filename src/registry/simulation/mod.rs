@@ -9,10 +9,10 @@ pub mod task;
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use rapid_core::provenance::KernelDriver;
+use rapid_core::provenance::{KernelDriver, ReplaySource};
 use rapid_core::time::Stamp;
 
 use self::task::SharedTrial;
@@ -91,6 +91,8 @@ pub enum SimSource {
         topic: String,
         /// Wall time of the episode's beginning as recorded, ns: time zero of the scenario.
         begin_ns: u64,
+        /// The episode, for a recording of this replay.
+        of: Arc<ReplaySource>,
     },
 }
 

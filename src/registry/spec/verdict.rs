@@ -39,6 +39,8 @@ pub struct Limits {
     pub rate: Option<f64>,
     /// Least share of the ticks while the device was attached that have a sample of it in `sync_window`.
     pub valid: Option<f64>,
+    /// Least share of the episode in which it was present.
+    pub present: Option<f64>,
 }
 
 /// Limits for the verdict on a modality.
@@ -73,6 +75,7 @@ impl VerdictSpec {
     /// * valid 90 %, 50 %: a policy is trained on the content of the frames, and a tick without a valid sample has
     ///   an old one or none. A device slower than twice `sync_window` misses ticks by its phase alone.
     /// * rate 90 %, 50 %: in poor light cameras expose longer and halve their rate.
+    /// * present off: sensors come and go, and the mask says when. See [`Self::of_an_expected_sensor`].
     pub fn defaults(kind: ModalityKind, stall_after: Duration, hz: Option<f64>) -> Self {
         let image = matches!(kind, ModalityKind::Image | ModalityKind::Depth);
         let suspect = Limits {
@@ -89,6 +92,7 @@ impl VerdictSpec {
             uncertain: None,
             rate: Some(0.9),
             valid: Some(0.9),
+            present: None,
         };
         let bad = Limits {
             lost: Some(0.05),
@@ -104,13 +108,22 @@ impl VerdictSpec {
             uncertain: None,
             rate: Some(0.5),
             valid: Some(0.5),
+            present: None,
         };
         Self { suspect, bad, hz }
     }
 
-    /// Also judges the clock of another computer: beyond half of `sync_window` a sample may belong to another frame.
+    /// Also judges how long it was present, because every episode must have it: beyond 90 % SUSPECT, beyond 50 % BAD.
     #[must_use]
-    pub fn of_another_computer(mut self, sync_window: Duration) -> Self {
+    pub fn of_an_expected_sensor(mut self) -> Self {
+        (self.suspect.present, self.bad.present) = (Some(0.9), Some(0.5));
+        self
+    }
+
+    /// Also judges how well the clock of another computer, or of a phone, is known: beyond half of `sync_window` a sample
+    /// may belong to another frame.
+    #[must_use]
+    pub fn of_another_clock(mut self, sync_window: Duration) -> Self {
         self.suspect.uncertain = Some(sync_window / 2);
         self
     }

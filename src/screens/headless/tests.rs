@@ -67,8 +67,9 @@ fn episode(dropped: u64, error: Option<&str>) -> EventKind {
                 }
                 (_, Some(error)) => (Grade::Bad, vec![format!("the file could not be written: {error}")]),
             };
-            let sensors = Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()] });
-            Verdict { grade, reasons, sensors }
+            let sensors =
+                Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()], away: Vec::new() });
+            Verdict { grade, reasons, sensors, replay_of: Vec::new() }
         },
     })
 }

@@ -250,7 +250,7 @@ impl Summary {
                 episode.seconds,
                 episode.messages,
                 text::size(episode.bytes),
-                text::plain(&episode.verdict.sensors())
+                text::plain(&episode.verdict.remarks())
             ));
             // If an error caused a reason, the reason includes the error.
             let reasons = &episode.verdict.reasons;

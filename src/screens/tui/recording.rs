@@ -124,7 +124,7 @@ fn idle(area: Rect, model: &Model, theme: Theme) -> Vec<Line<'static>> {
         first.spans.extend([Span::raw("   "), label, word, Span::raw(file(last, room, theme))]);
         return vec![first];
     }
-    let sensors = theme.safe(&verdict.sensors());
+    let sensors = theme.safe(&verdict.remarks());
     if !sensors.is_empty() {
         let room = width.saturating_sub(first.width() + 3);
         first.push_span(Span::raw("   "));

@@ -79,8 +79,8 @@ fn an_empty_rig() {
 fn three_devices_stream() {
     let mut end = three_streaming();
     end.last_episode = Some("episodes/2023-11-14_place-block_006.mcap".into());
-    let sensors = Some(Sensors { registered: 3, recorded: 3, without: Vec::new() });
-    end.last_verdict = Some(Verdict { grade: Grade::Good, reasons: Vec::new(), sensors });
+    let sensors = Some(Sensors { registered: 3, recorded: 3, without: Vec::new(), away: Vec::new() });
+    end.last_verdict = Some(Verdict { grade: Grade::Good, reasons: Vec::new(), sensors, replay_of: Vec::new() });
     end.log = vec![line(0, Level::Info, "cam_wrist is streaming"), line(1, Level::Info, "tof is streaming")];
     assert_snapshot!("three_80x24", draw(&measured(&end), (80, 24), THEME));
     assert_snapshot!("three_120x40", draw(&measured(&end), (120, 40), THEME));
@@ -97,7 +97,8 @@ fn the_last_verdict_is_shown_with_its_file_and_the_reasons_that_fit() {
                 "cam_wrist: frozen for 5.0 s: 151 samples byte for byte the same (limit 2.0 s)".to_owned(),
                 "tof: 3 of 213 samples lost by the device (limit 1 %)".to_owned(),
             ],
-            sensors: Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()] }),
+            sensors: Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()], away: Vec::new() }),
+            replay_of: Vec::new(),
         });
         let screen = draw(&measured(&end), (80, 24), THEME);
         assert_eq!(style_of(screen.buffer(), grade.word()).fg, Some(colour));
@@ -112,7 +113,7 @@ fn entry(number: usize, verdict: Option<Grade>) -> EpisodeEntry {
     EpisodeEntry {
         seconds: verdict.map(|_| 29.8),
         verdict,
-        sensors: verdict.map(|_| Sensors { registered: 3, recorded: 3, without: Vec::new() }),
+        sensors: verdict.map(|_| Sensors { registered: 3, recorded: 3, without: Vec::new(), away: Vec::new() }),
         ..EpisodeEntry::begin(file, "2023-11-14T22:13:20.000Z".to_owned())
     }
 }

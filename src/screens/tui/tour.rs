@@ -110,7 +110,12 @@ mod tests {
         step(&opening, Tour::Plug);
         step(&now, Tour::End);
         now.recording = None;
-        now.last_verdict = Some(Verdict { grade: rapid_status::Grade::Good, reasons: Vec::new(), sensors: None });
+        now.last_verdict = Some(Verdict {
+            grade: rapid_status::Grade::Good,
+            reasons: Vec::new(),
+            sensors: None,
+            replay_of: Vec::new(),
+        });
         step(&now, Tour::Over);
         // With a policy.
         let mut tour = Tour::default();

@@ -298,7 +298,14 @@ pub(super) fn negotiated(
 ) -> Negotiated {
     let Layout { format, width, height, .. } = layout;
     let format = Format::Pictures { fourcc: fourcc_text(fourcc(format)), width, height, fps: rate.map(Rate::hz) };
-    Negotiated { driver: Some(card.driver), card: Some(card.name), bus: Some(card.bus), format: Some(format), controls }
+    Negotiated {
+        driver: Some(card.driver),
+        card: Some(card.name),
+        bus: Some(card.bus),
+        format: Some(format),
+        controls,
+        replay_of: None,
+    }
 }
 
 /// Layout of a picture in a buffer.

@@ -118,7 +118,7 @@ impl Lan {
         }
     }
 
-    /// The clock of the computer that the device is on, if that is another one.
+    /// The clock of the phone, or of the computer that the device is on, if that is another one.
     pub fn clock(&self) -> Option<ClockOffset> {
         match &self.protocol {
             Protocol::Remote(remote) => remote.clock(),

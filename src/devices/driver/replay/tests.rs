@@ -16,7 +16,8 @@ fn file(bytes: &[u8]) -> tempfile::NamedTempFile {
 }
 
 fn device(file: &Path, topic: &str) -> Arc<SimDevice> {
-    let source = SimSource::Replay { file: file.to_owned(), topic: topic.to_owned(), begin_ns: BEGIN };
+    let source =
+        SimSource::Replay { file: file.to_owned(), topic: topic.to_owned(), begin_ns: BEGIN, of: Arc::default() };
     Arc::new(SimDevice::new("tof", source, stamp_of(Instant::now())))
 }
 
@@ -81,7 +82,11 @@ fn a_scenario_follows_the_recorded_mask() {
     let [tof, cam] = &scenario.devices[..] else { panic!("two devices") };
     assert_eq!((tof.usb.vid, tof.usb.pid, tof.usb.serial.as_deref()), (0x10c4, 0xea60, Some("T1")));
     assert_eq!((cam.usb.vid, cam.usb.pid, cam.usb.port.as_str()), (0x046d, 0x0825, "1-2.3"));
-    let topic = SimSource::Replay { file: file.path().to_owned(), topic: "/rapid/cam".into(), begin_ns: BEGIN };
+    let SimSource::Replay { of, .. } = &cam.source else { panic!("{cam:?}") };
+    assert_eq!((of.file.as_str(), of.begin_ns, of.verdict.as_str()), (&*file.path().to_string_lossy(), BEGIN, "BAD"));
+    assert!(!of.reasons.is_empty(), "nothing in it can be judged");
+    let of = Arc::clone(of);
+    let topic = SimSource::Replay { file: file.path().to_owned(), topic: "/rapid/cam".into(), begin_ns: BEGIN, of };
     assert_eq!(cam.source, topic);
     let events: Vec<_> =
         scenario.events.iter().map(|event| (event.at.as_millis(), event.device.as_str(), &event.action)).collect();

@@ -243,7 +243,8 @@ impl Collected {
         let (repaired, failed) = (repaired.as_deref(), failed.as_deref());
         let (about, summary, counted) = (&self.about, &self.summary, self.counted);
         let damage = &state::damage(&integrity);
-        let ending = Ending { file: integrity, seconds, about, summary, repaired, failed, damage, counted };
+        let ending =
+            Ending { file: integrity, seconds, about, summary, repaired, failed, damage, units: &units, counted };
         let verdict = match &judge {
             Some(judge) => Judgement::Episode(judge.judge(&mut modalities, &ending)),
             // A damaged file without the name of its writer may be an episode.

@@ -208,6 +208,7 @@ impl Judge {
             losses: if counted.count("lost").is_some() && is_complete { Losses::Apart } else { Losses::Together },
             file: file_state(ending),
             findings: &findings,
+            epochs: ending.units,
         };
         judge(&facts)
     }
@@ -259,7 +260,7 @@ pub(super) fn without_metadata(ending: &Ending<'_>) -> Verdict {
         FileState::Failed(why) => vec![reason, format!("the file could not be written: {why}")],
         FileState::Whole => vec![reason],
     };
-    Verdict { grade: Grade::Bad, reasons, sensors: None }
+    Verdict { grade: Grade::Bad, reasons, sensors: None, replay_of: Vec::new() }
 }
 
 /// What the recorder counted.

@@ -127,7 +127,7 @@ pub fn render_list(listed: &Listed, name: &str, columns: usize, palette: Palette
     let mut line = format!("{}  {name}", listed.verdict.column(palette));
     if let Judgement::Episode(verdict) = &listed.verdict {
         let _ =
-            write!(line, "  {:>8.1} s  {:>8}  {}", listed.seconds, text::size(listed.bytes), clean(&verdict.sensors()));
+            write!(line, "  {:>8.1} s  {:>8}  {}", listed.seconds, text::size(listed.bytes), clean(&verdict.remarks()));
     }
     let reasons = listed.verdict.reasons();
     if let Some(first) = reasons.first() {

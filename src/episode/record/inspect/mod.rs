@@ -192,7 +192,7 @@ pub struct EventReport {
 }
 
 /// The judgement of a file. As JSON `verdict`, which is `null` without one, `reasons` and `sensors`.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Judgement {
     /// It is an episode.
     Episode(Verdict),
@@ -243,9 +243,12 @@ impl Serialize for Judgement {
             verdict: Option<Grade>,
             reasons: Vec<&'a str>,
             sensors: Option<&'a Sensors>,
+            #[serde(skip_serializing_if = "<[String]>::is_empty")]
+            replay_of: &'a [String],
         }
         let sensors = self.verdict().and_then(|verdict| verdict.sensors.as_ref());
-        Json { verdict: self.grade(), reasons: self.reasons(), sensors }.serialize(serializer)
+        let replay_of = self.verdict().map_or(&[][..], |verdict| &verdict.replay_of);
+        Json { verdict: self.grade(), reasons: self.reasons(), sensors, replay_of }.serialize(serializer)
     }
 }
 

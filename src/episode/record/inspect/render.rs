@@ -159,14 +159,20 @@ fn write_verdict(out: &mut String, inspection: &Inspection, palette: Palette) ->
         return writeln!(out, "{}", palette.warn(&clean(&inspection.verdict.reasons().join("; "))));
     };
     let mut line = palette.grade(verdict.grade, verdict.grade.word());
-    if verdict.sensors.is_some() {
-        write!(line, "   {}", clean(&verdict.sensors()))?;
+    if let Some(sensors) = &verdict.sensors {
+        write!(line, "   {}", clean(&sensors.counted()))?;
     }
     if let Some(recorded) = inspection.recorded_verdict.as_ref().filter(|recorded| !recorded.agrees_with(verdict)) {
         let other = palette.grade(recorded.grade, recorded.grade.word());
         write!(line, "   when it was recorded: {other} {}", clean(&recorded.why()))?;
     }
     writeln!(out, "{line}")?;
+    for file in &verdict.replay_of {
+        writeln!(out, "  {}", clean(&format!("replay of {file}")))?;
+    }
+    for absence in verdict.sensors.iter().flat_map(|sensors| &sensors.away) {
+        writeln!(out, "  {}", clean(&absence.to_string()))?;
+    }
     for reason in &verdict.reasons {
         writeln!(out, "  {}", clean(reason))?;
     }

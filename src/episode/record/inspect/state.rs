@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 
+use rapid_core::provenance::ReplaySource;
 use rapid_core::sync::Grid;
 use rapid_core::text;
 use rapid_core::time::Stamp;
@@ -10,6 +11,7 @@ use rapid_status::{Grade, Verdict};
 use serde_json::Value;
 
 use super::super::metadata::CUT_SHORT;
+use super::super::sources::{Epochs, REPLAY_OF};
 use super::super::verdict::{FileState, Missing};
 use super::ModalityReport;
 use crate::episode_id::EpisodeId;
@@ -40,6 +42,8 @@ pub(super) struct Ending<'a> {
     pub(super) failed: Option<&'a str>,
     /// What is left out if parts of it are damaged.
     pub(super) damage: &'a str,
+    /// The epochs of the modalities.
+    pub(super) units: &'a Epochs,
     pub(super) counted: Counted,
 }
 
@@ -118,9 +122,15 @@ pub(super) fn sum(
 pub(super) fn recorded_verdict(summary: &BTreeMap<String, String>) -> Option<Verdict> {
     let word = summary.get("verdict")?;
     let grade = [Grade::Good, Grade::Suspect, Grade::Bad].into_iter().find(|grade| grade.word() == word)?;
-    let reasons = serde_json::from_str(summary.get("reasons")?).ok()?;
-    let sensors = summary.get("sensors").and_then(|sensors| serde_json::from_str(sensors).ok());
-    Some(Verdict { grade, reasons, sensors })
+    let reasons = of_json(summary, "reasons")?;
+    let sensors = of_json(summary, "sensors");
+    let replayed: Vec<ReplaySource> = of_json(summary, REPLAY_OF).unwrap_or_default();
+    let replay_of = replayed.iter().map(|replayed| replayed.name().to_owned()).collect();
+    Some(Verdict { grade, reasons, sensors, replay_of })
+}
+
+fn of_json<T: serde::de::DeserializeOwned>(map: &BTreeMap<String, String>, key: &str) -> Option<T> {
+    serde_json::from_str(map.get(key)?).ok()
 }
 
 /// What was counted in a file.

@@ -387,7 +387,8 @@ fn suspect() -> Verdict {
     Verdict {
         grade: Grade::Suspect,
         reasons: vec!["the file is not whole: its last record is cut".to_owned()],
-        sensors: Some(Sensors { registered: 2, recorded: 1, without: vec!["tof".to_owned()] }),
+        sensors: Some(Sensors { registered: 2, recorded: 1, without: vec!["tof".to_owned()], away: Vec::new() }),
+        replay_of: Vec::new(),
     }
 }
 

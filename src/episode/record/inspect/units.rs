@@ -2,20 +2,17 @@
 //!
 //! Invariant: no text of a file causes a panic; data in an unexpected format is omitted.
 
-use std::collections::BTreeMap;
-
 use serde_json::Value;
 
-/// The epochs of each modality, in the order of time.
-pub(super) type Units = BTreeMap<String, Vec<Value>>;
+use super::super::sources::Epochs;
 
 /// From the summary; in a file without one, from the record at its beginning and the events `opened`, each with its
 /// time in seconds after the beginning.
-pub(super) fn reported(summary: &str, beginning: &str, opened: Vec<(f64, String)>) -> Units {
+pub(super) fn reported(summary: &str, beginning: &str, opened: Vec<(f64, String)>) -> Epochs {
     if let Ok(units) = serde_json::from_str(summary) {
         return units;
     }
-    let mut units: Units = serde_json::from_str(beginning).unwrap_or_default();
+    let mut units: Epochs = serde_json::from_str(beginning).unwrap_or_default();
     for (at, event) in opened {
         let Ok(Value::Object(mut epoch)) = serde_json::from_str(&event) else { continue };
         let Some(Value::String(device)) = epoch.remove("device") else { continue };

@@ -27,6 +27,9 @@ fn good() -> Quality {
     }
 }
 
+/// No epochs.
+static NOWHERE: Epochs = Epochs::new();
+
 fn limits() -> VerdictSpec {
     VerdictSpec::defaults(ModalityKind::Image, Duration::from_millis(500), Some(30.0))
 }
@@ -42,6 +45,7 @@ fn facts<'a>(modalities: &'a [Judged<'a>], file: FileState<'a>) -> Facts<'a> {
         losses: Losses::Apart,
         file,
         findings: &[],
+        epochs: &NOWHERE,
     }
 }
 
@@ -120,15 +124,15 @@ fn every_check_has_its_text_and_its_two_limits() {
     );
     is(|q| q.clock_drift = Some(150.0), Bad, &["cam: its clock fell behind this machine's by 150 ms (limit 100 ms)"]);
     is(|q| q.clock_ahead = 12.0, Suspect, &["cam: captured up to 12 ms after it was received (limit 10 ms)"]);
-    // Only the clock of another computer is judged.
+    // Only the clock of a phone or of another computer is judged.
     is(|q| q.clock_uncertainty = Some(1e6), Good, &[]);
-    let far = limits().of_another_computer(Duration::from_millis(25));
+    let far = limits().of_another_clock(Duration::from_millis(25));
     let judged = |ms| {
         let quality = Quality { clock_uncertainty: Some(ms), ..good() };
         uncertain(&quality, &far)
     };
     assert_eq!(judged(12.5), None);
-    let text = "the clock of its computer was known to 13 ms only (limit 12 ms)";
+    let text = "capture times uncertain by ±13 ms (limit 12 ms)";
     assert_eq!(judged(12.6), Some((Suspect, text.to_owned())));
     is(|q| q.hz = Some(15.04), Suspect, &["cam: 15.0 samples a second while present, of 30 (limit 90 %)"]);
     is(|q| q.hz = Some(14.9), Bad, &["cam: 14.9 samples a second while present, of 30 (limit 50 %)"]);
@@ -181,8 +185,60 @@ fn an_expected_sensor_without_samples_is_suspect_and_verdicts_name_missing_ones(
         let report = judge(&Facts { expect: &expect, ..facts(&modalities, FileState::Whole) });
         assert_eq!(report.reasons, reasons);
         assert_eq!(report.grade == Grade::Suspect, !reasons.is_empty());
-        assert_eq!(report.sensors(), "1 of 3 sensors, without tof, gel");
+        assert_eq!(report.remarks(), "0 of 3 sensors, without tof, gel, cam away 3.0 s of 10.0 s");
     }
+}
+
+#[test]
+fn an_expected_sensor_is_judged_by_its_share_of_the_episode_and_an_absence_is_always_named() {
+    use Grade::{Bad, Good, Suspect};
+    let expect = ["cam".to_owned()];
+    // Share of ten seconds, samples; as one of `expect`: grade and reason; what is said of it in any case.
+    for (presence, samples, grade, reason, named) in [
+        (1.0, 300, Good, "", "1 of 1 sensor"),
+        (0.99, 297, Good, "", "0 of 1 sensor, cam away 100 ms of 10.0 s"),
+        (0.9, 270, Good, "", "0 of 1 sensor, cam away 1.0 s of 10.0 s"),
+        (
+            0.899,
+            269,
+            Suspect,
+            "cam: away 1.0 s of 10.0 s: present for 89 % (limit 90 %)",
+            "0 of 1 sensor, cam away 1.0 s of 10.0 s",
+        ),
+        (
+            0.5,
+            150,
+            Suspect,
+            "cam: away 5.0 s of 10.0 s: present for 50 % (limit 90 %)",
+            "0 of 1 sensor, cam away 5.0 s of 10.0 s",
+        ),
+        (
+            0.1,
+            30,
+            Bad,
+            "cam: away 9.0 s of 10.0 s: present for 10 % (limit 50 %)",
+            "0 of 1 sensor, cam away 9.0 s of 10.0 s",
+        ),
+        (0.0, 0, Bad, "cam: took no part, and is expected (expect under [rig])", "0 of 1 sensor, without cam"),
+    ] {
+        let present = 10.0 * presence;
+        let quality = Quality { samples, presence: Some(presence), present, plugged: present, opening: 0.0, ..good() };
+        let of = |limits: VerdictSpec, expect| {
+            let modalities = [Judged { name: "cam", quality: &quality, limits }];
+            judge(&Facts { expect, ..facts(&modalities, FileState::Whole) })
+        };
+        let verdict = of(limits().of_an_expected_sensor(), &expect);
+        assert_eq!((verdict.grade, verdict.why().as_str()), (grade, reason), "{presence}");
+        assert_eq!(verdict.remarks(), named, "{presence}");
+        // Of a sensor that may come and go.
+        let verdict = of(limits(), &[]);
+        assert_eq!((verdict.grade == Good, verdict.remarks().as_str()), (samples > 0, named), "{presence}");
+    }
+    // Without a mask nothing is known of its presence.
+    let unknown = Quality { presence: None, ..good() };
+    let modalities = [Judged { name: "cam", quality: &unknown, limits: limits().of_an_expected_sensor() }];
+    let verdict = judge(&facts(&modalities, FileState::Whole));
+    assert_eq!((verdict.grade, verdict.remarks().as_str()), (Good, "1 of 1 sensor"));
 }
 
 #[test]
@@ -277,8 +333,10 @@ fn a_disabled_check_gives_no_reason() {
         uncertain: None,
         rate: None,
         valid: None,
+        present: None,
     };
     let quality = Quality {
+        presence: Some(0.1),
         lost: 50,
         dropped: 50,
         damaged: 50,

@@ -10,8 +10,9 @@
 //!    of a zero that was not seen for a while.
 //! 3. A time that goes back, or is further ahead than any delay explains, is a bad sample. The phone's clock has begun
 //!    again once [`PERSISTS`] of them have come.
-//! 4. A new connection keeps the zero, unless it may have moved too far meanwhile.
-//! 5. A clock that stood still, as it does while the phone sleeps, is a new one: its distance from the phone's wall clock
+//! 4. A sample older than [`OLDEST`] is bad, as one of a program is. Up to that it is late.
+//! 5. A new connection keeps the zero, unless it may have moved too far meanwhile.
+//! 6. A clock that stood still, as it does while the phone sleeps, is a new one: its distance from the phone's wall clock
 //!    grew, and the difference with it.
 //!
 //! A delay that all frames have in common, and one that rises slower than clocks drift, cannot be seen from one side.
@@ -23,6 +24,7 @@ use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
+use rapid_core::capture::OLDEST;
 use rapid_core::time::{Stamp, nanoseconds};
 
 use super::packet::Frame;
@@ -58,7 +60,7 @@ static KEPT: Mutex<BTreeMap<String, PhoneClock>> = Mutex::new(BTreeMap::new());
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Captured {
     pub(super) at: Stamp,
-    /// Its time is none: `at` is its arrival.
+    /// Its time cannot be right: `at` is an estimate, by the delay of the one before.
     pub(super) is_damaged: bool,
 }
 
@@ -72,8 +74,9 @@ pub(super) struct PhoneClock {
     /// The phone's newest time, and its wall clock minus that, ns.
     newest: f64,
     wall: Option<f64>,
-    /// When the newest good frame arrived.
+    /// When the newest good frame arrived, and how long it had taken.
     last: Stamp,
+    delay: Duration,
 }
 
 /// The least difference, as it was when it was last seen.
@@ -135,7 +138,7 @@ impl PhoneClock {
 
     /// When a frame that `arrived` was captured.
     pub(super) fn captured(&mut self, frame: &Frame, arrived: Stamp) -> Captured {
-        let bad = Captured { at: arrived, is_damaged: true };
+        let bad = Captured { at: arrived.before(self.delay), is_damaged: true };
         // Beyond 100 years it is not a clock.
         if !(0.0..3.2e9).contains(&frame.device_time) {
             return bad;
@@ -163,8 +166,13 @@ impl PhoneClock {
         (self.newest, self.wall, self.last, self.is_new) = (device, wall, arrived, false);
         let zero = self.zero.get_or_insert_with(|| Zero::new(difference, arrived));
         zero.see(difference, arrived);
-        let at = u64::try_from(device_ns + zero.at(arrived)).unwrap_or(0);
-        Captured { at: Stamp(at).min(arrived), is_damaged: false }
+        let at = Stamp(u64::try_from(device_ns + zero.at(arrived)).unwrap_or(0)).min(arrived);
+        let delay = arrived.since(at);
+        if delay > OLDEST {
+            return bad;
+        }
+        self.delay = delay;
+        Captured { at, is_damaged: false }
     }
 }
 

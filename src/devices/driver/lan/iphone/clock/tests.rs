@@ -191,6 +191,16 @@ fn a_first_minute_of_long_delays_is_stated_when_it_is_known() {
 }
 
 #[test]
+fn a_sample_is_late_or_damaged_never_fresh() {
+    for (ms, is_damaged) in [(5000.0, false), (9900.0, false), (12_000.0, true), (3_600_000.0, true)] {
+        let seen = play(&Scenario::new(&[(20.0, What::Slower(ms)), (60.0, What::Slower(0.0))]));
+        let slow = |seen: &&Seen| (20.0..60.0).contains(&seen.at);
+        assert!(seen.iter().filter(slow).all(|seen| seen.is_damaged == is_damaged), "{ms}");
+        assert!(worst(&seen, 10.0) < 3.0, "{ms}");
+    }
+}
+
+#[test]
 fn a_clock_that_began_again_is_believed_once_it_persists() {
     for what in [What::Wrong(u32::MAX, -60.0), What::Wrong(u32::MAX, 60.0), What::Restart] {
         let seen = play(&Scenario::new(&[(20.0, what)]));
