@@ -6,6 +6,9 @@
 //!
 //! Invariant: a run on bound memory allocates nothing on this side of the library.
 
+use std::sync::Arc;
+use std::time::Duration;
+
 use ort::ep;
 use ort::memory::Allocator;
 use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
@@ -57,10 +60,22 @@ pub enum GraphProblem {
     /// A run failed, with onnxruntime's message.
     #[error("{0}")]
     Run(String),
+    /// Its first run has not ended within this time.
+    #[error(
+        "its trial run has not ended after {0:?}: it has a loop without an end, or is far too slow for this machine; export \
+         it again, or try fewer --denoising-steps or more --threads"
+    )]
+    Endless(Duration),
+    /// A chunk of the trial is NaN or infinite.
+    #[error(
+        "its trial run gives NaN or infinity: all actions would be refused; export it again, from weights and statistics \
+         that are finite"
+    )]
+    NotFinite,
 }
 
 impl GraphProblem {
-    fn in_graph(self, name: &str) -> GraphError {
+    pub(super) fn in_graph(self, name: &str) -> GraphError {
         GraphError { name: name.to_owned(), what: self }
     }
 }
@@ -115,7 +130,27 @@ impl LoadedGraph {
             selector = selector.preallocate(output.name(), make_output(&name, &tensor_shape(output))?);
         }
         let options = RunOptions::new().map_err(|error| run_error(&name, &error))?.with_outputs(selector);
-        Ok(BoundGraph { name, session, inputs, options })
+        Ok(BoundGraph { name, session, inputs, options, trial: None, is_finite: true })
+    }
+}
+
+/// Ends the runs of graphs that are [on trial](BoundGraph::set_trial), from another thread.
+#[derive(Clone)]
+pub struct Trial(Arc<RunOptions>);
+
+impl Trial {
+    /// A new one.
+    ///
+    /// # Errors
+    /// When onnxruntime has no memory.
+    pub fn new() -> Result<Self, GraphError> {
+        RunOptions::new().map(|options| Self(Arc::new(options))).map_err(|error| run_error("onnxruntime", &error))
+    }
+
+    /// Ends them, after the node that each of them computes: they are errors then.
+    pub fn end(&self) {
+        // It fails for null only.
+        let _ = self.0.terminate();
     }
 }
 
@@ -125,9 +160,30 @@ pub struct BoundGraph {
     session: Session,
     inputs: Vec<SessionInputValue<'static>>,
     options: RunOptions<HasSelectedOutputs>,
+    trial: Option<Trial>,
+    /// All numbers of its trial's runs are finite.
+    is_finite: bool,
 }
 
 impl BoundGraph {
+    /// Its name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Puts it on trial, or ends that: until then, its runs can be ended, and allocate.
+    pub fn set_trial(&mut self, trial: Option<Trial>) {
+        if trial.is_some() {
+            self.is_finite = true;
+        }
+        self.trial = trial;
+    }
+
+    /// Whether all numbers of its last trial are finite.
+    pub const fn is_finite(&self) -> bool {
+        self.is_finite
+    }
+
     /// The index of the input called `name`.
     ///
     /// # Errors
@@ -183,10 +239,18 @@ impl BoundGraph {
     /// # Errors
     /// When onnxruntime reports an error.
     pub fn run<T>(&mut self, read: impl FnOnce(&[f32]) -> T) -> Result<T, GraphError> {
-        let outputs = self.session.run_with_options(self.inputs.as_slice(), &self.options);
+        let (inputs, is_trial) = (self.inputs.as_slice(), self.trial.is_some());
+        let outputs = match &self.trial {
+            // Options with memory for the outputs belong to one thread.
+            Some(Trial(options)) => self.session.run_with_options(inputs, &**options),
+            None => self.session.run_with_options(inputs, &self.options),
+        };
         outputs
             .and_then(|outputs| match outputs.values().next() {
-                Some(output) => output.try_extract_tensor().map(|(_, values)| read(values)),
+                Some(output) => output.try_extract_tensor().map(|(_, values)| {
+                    self.is_finite &= !is_trial || values.iter().all(|value: &f32| value.is_finite());
+                    read(values)
+                }),
                 None => Err(ort::Error::new("the graph has no output")),
             })
             .map_err(|error| run_error(&self.name, &error))

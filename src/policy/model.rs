@@ -2,13 +2,17 @@
 //!
 //! Invariant: the same request gives the same chunk, given the same reference pictures.
 //! Invariant: samples of an absent modality are not read: its numbers are zeros and its element of the mask is 0.
+//! Invariant: a policy that is loaded has computed a finite chunk ([`Model::load`]).
 //! Invariant: a picture of a history is converted once, as long as it is a step of one request after another.
 
+use std::sync::mpsc::{RecvTimeoutError, sync_channel};
 use std::time::{Duration, Instant};
 
 use rapid_core::sample::Encoding;
+use rapid_registry::Provider;
 
-use super::bundle::{Bundle, ObservationInput, VectorOperation};
+use super::bundle::{Bundle, ObservationInput, POLICY_FILE, VectorOperation};
+use super::graphs::{GraphError, GraphProblem, Trial};
 use super::observation::{ObservationTensors, VectorError};
 use super::onnxruntime::Environment;
 use super::picture::{Picture, PictureError, Preprocessor};
@@ -45,6 +49,12 @@ pub enum SampleError {
     Encoding,
 }
 
+/// Time for the trial of a policy: many times what a chunk may take that is worth to be computed.
+const LIMIT: Duration = Duration::from_mins(1);
+/// The same where the first run compiles the graphs.
+const LIMIT_COMPILED: Duration = Duration::from_mins(20);
+/// Time for the node that a graph computes when its trial is ended.
+const GRACE: Duration = Duration::from_secs(5);
 /// Chunks that are timed when a policy is loaded.
 const REHEARSALS: usize = 3;
 
@@ -75,11 +85,27 @@ struct InputBuffer {
 type SampleId = (u64, u32, u64);
 
 impl Model {
-    /// Loads the graphs of a bundle.
+    /// Loads the graphs of a bundle, and computes a chunk on trial: from an observation in which all is present, and every
+    /// picture and number is the middle of its range.
     ///
     /// # Errors
-    /// When the graphs do not match the bundle.
+    /// When the graphs do not match the bundle, or the chunk is not finite, or not there within a minute (twenty where it is
+    /// not computed on the processor).
     pub fn load(bundle: &Bundle, environment: &Environment, computing: Computing) -> Result<Self, PolicyError> {
+        let limit = if computing.on.provider == Provider::Cpu { LIMIT } else { LIMIT_COMPILED };
+        Self::load_within(bundle, environment, computing, limit)
+    }
+
+    /// As [`Self::load`], with this limit of the trial.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_within(
+        bundle: &Bundle,
+        environment: &Environment,
+        computing: Computing,
+        limit: Duration,
+    ) -> Result<Self, PolicyError> {
         let inputs = bundle.observations.iter().map(|observation| InputBuffer {
             modality: observation.modality.clone(),
             pictures: match observation.input {
@@ -94,17 +120,17 @@ impl Model {
             first: None,
             written: vec![None; observation.history.as_ref().map_or(0, |history| history.steps)],
         });
-        let sampler = Sampler::new(bundle, environment, computing)?;
+        let sampler = try_out(Sampler::new(bundle, environment, computing)?, bundle, limit)?;
         Ok(Self { inputs: inputs.collect(), tensors: ObservationTensors::new(bundle), sampler })
     }
 
-    /// The median time of a chunk, after a first one, which is slower. The observation is empty: the work is the same.
+    /// The median time of a chunk: the first one, which is slower, was that of the trial. The observation is empty: the work
+    /// is the same.
     ///
     /// # Errors
     /// When onnxruntime fails.
     pub fn rehearse(&mut self) -> Result<Duration, PolicyError> {
         let mut chunk = vec![0.0; self.chunk_len()];
-        self.sampler.chunk(&self.tensors, 0, &mut chunk)?;
         let mut times = [Duration::ZERO; REHEARSALS];
         for time in &mut times {
             let begun = Instant::now();
@@ -177,6 +203,41 @@ impl Model {
             }
         }
         Ok(&self.tensors)
+    }
+}
+
+/// Computes a chunk on a thread of its own: what does not even end when it is told to is left behind.
+fn try_out(mut sampler: Sampler, bundle: &Bundle, limit: Duration) -> Result<Sampler, PolicyError> {
+    let mut observation = ObservationTensors::new(bundle);
+    for at in 0..bundle.observations.len() {
+        observation.set_present(at, true);
+        (0..observation.valid(at).len()).for_each(|step| observation.set_valid(at, step, true));
+    }
+    let trial = Trial::new()?;
+    let (done, result) = sync_channel(1);
+    let thread = std::thread::Builder::new().name("policy-trial".to_owned()).spawn({
+        let trial = trial.clone();
+        move || {
+            let tried = sampler.try_out(&observation, &trial).map(|()| sampler);
+            // Nobody waits any longer.
+            let _ = done.send(tried);
+        }
+    })?;
+    let endless = |name: &str| Err(GraphProblem::Endless(limit).in_graph(name).into());
+    match result.recv_timeout(limit) {
+        Ok(tried) => tried,
+        Err(RecvTimeoutError::Disconnected) => match thread.join() {
+            Err(panic) => std::panic::resume_unwind(panic),
+            Ok(()) => endless(POLICY_FILE),
+        },
+        Err(RecvTimeoutError::Timeout) => {
+            trial.end();
+            match result.recv_timeout(GRACE) {
+                Ok(Err(PolicyError::Graph(GraphError { name, what: GraphProblem::Run(_) }))) => endless(&name),
+                Ok(tried) => tried,
+                Err(_) => endless(POLICY_FILE),
+            }
+        }
     }
 }
 

@@ -8,11 +8,13 @@
 //! Invariant: non-finite values are passed on unchanged: the action queue refuses them.
 //! Invariant: a chunk is computed without an allocation on this side of onnxruntime.
 
+use std::io;
+
 use rapid_core::random::Random;
 use rapid_registry::InferenceSpec;
 
-use super::bundle::{Bundle, BundleErrors, Graph};
-use super::graphs::{BoundGraph, GraphError, LoadedGraph};
+use super::bundle::{Bundle, BundleErrors, Graph, POLICY_FILE};
+use super::graphs::{BoundGraph, GraphError, GraphProblem, LoadedGraph, Trial};
 use super::normalize::Normalizer;
 use super::observation::ObservationTensors;
 use super::onnxruntime::Environment;
@@ -33,6 +35,9 @@ pub enum PolicyError {
     /// The schedule cannot be run.
     #[error(transparent)]
     Scheduler(#[from] SchedulerError),
+    /// The system provides no thread for the trial.
+    #[error("a thread: {0}")]
+    Thread(#[from] io::Error),
     /// The output does not have the length of a chunk.
     #[error("a chunk of {expected} values does not go into {found}")]
     Place {
@@ -125,6 +130,27 @@ impl Sampler {
         let first = draw();
         let steps = (0..self.steps()).filter(|at| self.scheduler.wants_noise(*at)).map(|_| draw());
         (first, steps.collect())
+    }
+
+    /// Computes a chunk that `trial` can end, and whose numbers must be finite.
+    ///
+    /// # Errors
+    /// As [`Self::chunk`], and with the file from which the first number comes that is not finite.
+    pub fn try_out(&mut self, observation: &ObservationTensors, trial: &Trial) -> Result<(), PolicyError> {
+        for graph in [&mut self.encoder, &mut self.denoiser] {
+            graph.set_trial(Some(trial.clone()));
+        }
+        let mut chunk = vec![0.0; self.chunk_len()];
+        let computed = self.chunk(observation, 0, &mut chunk);
+        for graph in [&mut self.encoder, &mut self.denoiser] {
+            graph.set_trial(None);
+        }
+        computed?;
+        if chunk.iter().all(|value| value.is_finite()) {
+            return Ok(());
+        }
+        let from = [&self.encoder, &self.denoiser].into_iter().find(|graph| !graph.is_finite());
+        Err(GraphProblem::NotFinite.in_graph(from.map_or(POLICY_FILE, BoundGraph::name)).into())
     }
 
     /// Writes a chunk, action by action, denormalised, as the network gives it: see

@@ -5,6 +5,8 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "what fails here fails a test")]
 
+use std::time::Duration;
+
 use rapid_core::sample::{Encoding, SampleHeader};
 use rapid_policy::bundle::{Bundle, ImageSpec, ObservationInput};
 use rapid_policy::graphs::LoadedGraph;
@@ -156,6 +158,36 @@ fn with_ddpm_the_noise_of_the_steps_depends_on_the_seed_too() {
     let first = chunk(&mut sampler, &observation, 5);
     assert_eq!(first, chunk(&mut sampler, &observation, 5));
     assert_ne!(first, chunk(&mut sampler, &observation, 6));
+}
+
+/// What is wrong with a policy of these graphs, when it is loaded.
+fn refusal(encoder: &[u8], denoiser: &[u8], changes: &[Change<'_>]) -> Option<String> {
+    let folder = tempfile::tempdir().unwrap();
+    onnx::write_both(folder.path(), encoder, denoiser, changes);
+    let bundle = Bundle::load(folder.path()).unwrap();
+    let environment = Environment::open(None).unwrap();
+    let limit = Duration::from_millis(if denoiser == onnx::denoiser_of(1.0, true) { 300 } else { 60_000 });
+    Model::load_within(&bundle, &environment, Computing::default(), limit).err().map(|error| error.to_string())
+}
+
+#[test]
+fn a_policy_whose_chunks_are_not_finite_is_refused_when_it_is_loaded() {
+    let (encoder, denoiser) = (onnx::encoder(), onnx::denoiser());
+    assert_eq!(refusal(&encoder, &denoiser, &[]), None);
+    for share in [f32::NAN, f32::INFINITY, f32::MAX] {
+        let error = refusal(&encoder, &onnx::denoiser_of(share, false), &[]).unwrap();
+        assert!(error.starts_with("denoiser.onnx: its trial run gives NaN or infinity"), "{error}");
+    }
+    // The numbers of its actions are too large for those that are executed.
+    let huge = Change { what: r#""mean": [0.5], "std": [0.25]"#, with: r#""mean": [3.4e38], "std": [3.4e38]"# };
+    let error = refusal(&encoder, &denoiser, &[huge]).unwrap();
+    assert!(error.starts_with("policy.json: its trial run gives NaN or infinity"), "{error}");
+}
+
+#[test]
+fn a_policy_that_does_not_end_is_refused_when_it_is_loaded() {
+    let error = refusal(&onnx::encoder(), &onnx::denoiser_of(1.0, true), &[]).unwrap();
+    assert!(error.starts_with("denoiser.onnx: its trial run has not ended after 300ms"), "{error}");
 }
 
 #[test]

@@ -42,11 +42,15 @@ pub(crate) fn write_bundle(folder: &Path, changes: &[Change<'_>]) {
 
 /// The same with another encoder.
 pub(crate) fn write_graphs(folder: &Path, encoder: &[u8], changes: &[Change<'_>]) {
-    let denoiser = denoiser();
+    write_both(folder, encoder, &denoiser(), changes);
+}
+
+/// The same with these graphs.
+pub(crate) fn write_both(folder: &Path, encoder: &[u8], denoiser: &[u8], changes: &[Change<'_>]) {
     std::fs::create_dir_all(folder).expect("folder of the bundle");
     std::fs::write(folder.join("encoder.onnx"), encoder).expect("encoder");
-    std::fs::write(folder.join("denoiser.onnx"), &denoiser).expect("denoiser");
-    let mut policy = POLICY.replace("ENCODER", &sum(encoder)).replace("DENOISER", &sum(&denoiser));
+    std::fs::write(folder.join("denoiser.onnx"), denoiser).expect("denoiser");
+    let mut policy = POLICY.replace("ENCODER", &sum(encoder)).replace("DENOISER", &sum(denoiser));
     for Change { what, with } in changes {
         assert!(policy.contains(what), "{what} is not in policy.json");
         policy = policy.replace(what, with);
@@ -151,12 +155,17 @@ fn encoder_of(history: Option<usize>) -> Vec<u8> {
 }
 
 pub(crate) fn denoiser() -> Vec<u8> {
+    denoiser_of(SAMPLE_SHARE, false)
+}
+
+/// The denoiser with another share of the sample; if it `loops`, it adds up something without an end.
+pub(crate) fn denoiser_of(sample_share: f32, loops: bool) -> Vec<u8> {
     let mut graph = Message::default();
     let sample = [0, HORIZON as u64, ACTION as u64];
     graph.message(11, &tensor("sample", FLOAT, &sample));
     graph.message(11, &tensor("timestep", INT64, &[0]));
     graph.message(11, &tensor("global_cond", FLOAT, &[0, 3]));
-    for (name, share) in [("a", SAMPLE_SHARE), ("b", CONDITION_SHARE), ("c", TIMESTEP_SHARE)] {
+    for (name, share) in [("a", sample_share), ("b", CONDITION_SHARE), ("c", TIMESTEP_SHARE)] {
         graph.message(5, &floats(name, &[1], &[share]));
     }
     graph.message(5, &whole_numbers("column", &[3], &[-1, 1, 1]));
@@ -168,9 +177,28 @@ pub(crate) fn denoiser() -> Vec<u8> {
     graph.message(1, &node("Reshape", &["y_flat", "column"], "y", &[]));
     graph.message(1, &node("Reshape", &["t_flat", "column"], "t", &[]));
     graph.message(1, &node("Add", &["x", "y"], "xy", &[]));
-    graph.message(1, &node("Add", &["xy", "t"], "prediction", &[]));
+    if loops {
+        graph.message(5, &whole_numbers("most", &[], &[i64::MAX]));
+        graph.message(5, &constant("goes_on", BOOL, &[], &[1]));
+        graph.message(1, &node("Loop", &["most", "goes_on", "xy"], "xyz", &[subgraph("body", &endless_body(&sample))]));
+    }
+    let sum = if loops { "xyz" } else { "xy" };
+    graph.message(1, &node("Add", &[sum, "t"], "prediction", &[]));
     graph.message(12, &tensor("prediction", FLOAT, &sample));
     model(graph)
+}
+
+/// The body of a loop that adds a number to what it carries, each time.
+fn endless_body(carried: &[u64]) -> Message {
+    let mut body = Message::default();
+    body.bytes(2, b"body");
+    body.message(11, &tensor("turn", INT64, &[])).message(11, &tensor("again", BOOL, &[]));
+    body.message(11, &tensor("in", FLOAT, carried));
+    body.message(5, &floats("little", &[1], &[0.001]));
+    body.message(1, &node("Identity", &["again"], "once_more", &[]));
+    body.message(1, &node("Add", &["in", "little"], "out", &[]));
+    body.message(12, &tensor("once_more", BOOL, &[])).message(12, &tensor("out", FLOAT, carried));
+    body
 }
 
 /// The encoder with an additional field in the model (`field` of `ModelProto`).
@@ -257,6 +285,13 @@ fn node(operator: &str, inputs: &[&str], output: &str, attributes: &[Message]) -
 fn integer(name: &str, value: u64) -> Message {
     let mut attribute = Message::default();
     attribute.bytes(1, name.as_bytes()).number(3, value).number(20, 2);
+    attribute
+}
+
+/// `AttributeProto` of a graph.
+fn subgraph(name: &str, graph: &Message) -> Message {
+    let mut attribute = Message::default();
+    attribute.bytes(1, name.as_bytes()).message(6, graph).number(20, 5);
     attribute
 }
 
