@@ -20,8 +20,10 @@ use crate::partial::finished_name;
 
 /// Larger than the notes of any episode.
 const LARGEST: u64 = 1 << 24;
-/// How often another program is waited for that changes notes in the same folder, each time 5 ms.
-const TRIES: u32 = 200;
+/// How often another program is waited for that changes notes in the same folder.
+const TRIES: u32 = 1000;
+/// Between two tries.
+const PAUSE: Duration = Duration::from_millis(5);
 /// For people who open it.
 const HEAD: &str = "# What people noted about the episode beside it; `rapid label` changes it.\n";
 /// Ending of the file, after the whole name of the episode.
@@ -37,6 +39,12 @@ pub enum NotesError {
         path: PathBuf,
         /// The error of the system.
         source: io::Error,
+    },
+    /// Another program keeps the right to change notes.
+    #[error("{}: another program has been changing notes here for {} s: try again when it has ended", path.display(), (PAUSE * TRIES).as_secs())]
+    Busy {
+        /// The folder.
+        path: PathBuf,
     },
     /// The file is not one of notes.
     #[error("{}: line {line}: {why}; correct it, or remove the file", path.display())]
@@ -81,14 +89,15 @@ pub fn read(folder: &Folder, name: &Path) -> Result<Option<Notes>, NotesError> {
 /// there is no file yet: what the session's file says.
 ///
 /// # Errors
-/// When the file cannot be read or is not one of notes, or the disk does not accept it; nothing has changed then.
+/// When the file cannot be read or is not one of notes, another program does not let go of the folder, or the disk does
+/// not accept it; nothing has changed then.
 pub fn change(
     folder: &Folder,
     name: &Path,
     before: impl FnOnce() -> Notes,
     changes: &[NotesChange],
 ) -> Result<Notes, NotesError> {
-    let _alone = Alone::take(folder);
+    let _alone = Alone::take(folder)?;
     let mut notes = read(folder, name)?.unwrap_or_else(before);
     for change in changes {
         notes.apply(change);
@@ -101,16 +110,15 @@ pub fn change(
 struct Alone<'a>(&'a Folder);
 
 impl<'a> Alone<'a> {
-    /// Waits for another program that changes some, not for one that never ends, nor where the file system has no locks:
-    /// the last of two changes counts then.
-    fn take(folder: &'a Folder) -> Self {
+    /// Waits for another program that changes some. Where the file system has no locks, the last of two changes counts.
+    fn take(folder: &'a Folder) -> Result<Self, NotesError> {
         for _ in 0..TRIES {
             match flock(folder.descriptor(), FlockOperation::NonBlockingLockExclusive) {
-                Err(Errno::WOULDBLOCK) => std::thread::sleep(Duration::from_millis(5)),
-                _ => break,
+                Err(Errno::WOULDBLOCK) => std::thread::sleep(PAUSE),
+                _ => return Ok(Self(folder)),
             }
         }
-        Self(folder)
+        Err(NotesError::Busy { path: folder.path().to_owned() })
     }
 }
 
