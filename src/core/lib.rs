@@ -8,6 +8,7 @@
 
 pub mod action;
 pub mod bell;
+pub mod clip;
 pub mod interlock;
 pub mod mask;
 pub mod modality;

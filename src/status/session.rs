@@ -175,6 +175,9 @@ pub struct EpisodeEntry {
     /// Which sensors took part.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sensors: Option<Sensors>,
+    /// The names of the files that were replayed.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub replay_of: Vec<String>,
 }
 
 impl EpisodeEntry {
@@ -192,6 +195,7 @@ impl EpisodeEntry {
             discarded: false,
             marks: Vec::new(),
             sensors: None,
+            replay_of: Vec::new(),
         }
     }
 

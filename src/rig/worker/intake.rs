@@ -6,7 +6,8 @@
 //!    the sample damaged: nothing says when it was captured. Its stamp is an estimate, by the delay of the sample before
 //!    it, so that it has a place in a recording. Older means late or damaged, never better: up to [`OLDEST`] a sample
 //!    keeps its capture time, and the verdict counts it as late.
-//! 4. A gap in `seq` is a loss; a counter that jumps or restarts is not.
+//! 4. A gap in `seq` is a loss; a counter that jumps or restarts is not. A number that is repeated shows that nothing is
+//!    counted: the sample is passed on, and is a duplicate.
 //!
 //! Invariant: pure; nothing a program can write makes this panic, or passes a number that our own driver would not have
 //! sent.
@@ -14,7 +15,7 @@
 use std::time::Duration;
 
 use rapid_core::modality::{ModalityId, ModalityKind};
-use rapid_core::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, FLAG_ERROR, SampleHeader};
+use rapid_core::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, FLAG_ERROR, FLAG_SAME_NUMBER, SampleHeader};
 use rapid_core::time::Stamp;
 use rapid_registry::ProcessSpec;
 
@@ -76,6 +77,7 @@ pub(super) struct Intake {
     complaint: Option<String>,
     has_refused: bool,
     has_doubted: bool,
+    has_repeated: bool,
 }
 
 impl Intake {
@@ -97,6 +99,7 @@ impl Intake {
             complaint: None,
             has_refused: false,
             has_doubted: false,
+            has_repeated: false,
         }
     }
 
@@ -111,7 +114,16 @@ impl Intake {
                 return None;
             }
         };
-        let (captured, flags) = self.time(header, now);
+        let (captured, mut flags) = self.time(header, now);
+        if self.last == Some(header.seq) {
+            flags |= FLAG_SAME_NUMBER;
+            if !std::mem::replace(&mut self.has_repeated, true) {
+                let seq = header.seq;
+                self.complaint = Some(format!(
+                    "samples are duplicates, of seq {seq} again: a program must count its samples in seq"
+                ));
+            }
+        }
         let hole = self.last.and_then(|last| header.seq.checked_sub(last)?.checked_sub(1));
         self.last = Some(header.seq);
         let lost = hole.filter(|hole| *hole <= LARGEST_HOLE).unwrap_or(0);

@@ -22,9 +22,12 @@ mod udp;
 
 use std::time::Duration;
 
+use rapid_core::clip::ClipNotice;
 use rapid_core::provenance::{Format, Negotiated};
 use rapid_registry::device::DeviceNode;
 use rapid_registry::{DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec, RemoteSamples};
+
+use tokio::sync::mpsc;
 
 use super::{Agreed, ClockOffset, DriverError, Reading};
 use crate::link::{LinkState, LinkWatch, NetworkLink};
@@ -121,6 +124,11 @@ impl Lan {
     /// The clock of the computer that the device is on, if that is another one.
     pub fn clock(&self) -> Option<ClockOffset> {
         if let Protocol::Remote(remote) = &self.protocol { remote.clock() } else { None }
+    }
+
+    /// What a camera that records by itself does; `Some` at the first call only.
+    pub fn clips(&mut self) -> Option<mpsc::Receiver<ClipNotice>> {
+        if let Protocol::Gopro(gopro) = &mut self.protocol { gopro.clips() } else { None }
     }
 
     /// The episode with this file begins, or with `None` the one in progress ends: a camera that records by itself

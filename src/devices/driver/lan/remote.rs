@@ -9,7 +9,7 @@
 use std::time::Duration;
 
 use rapid_core::remote::{FrameError, Frames, Head, Kind, request};
-use rapid_core::sample::Encoding;
+use rapid_core::sample::{Encoding, FLAG_SAME_NUMBER};
 use rapid_core::time::Stamp;
 use rapid_registry::{PixelFormat, RemoteSamples};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -96,6 +96,7 @@ impl Remote {
             return Err(self.server.place.lost("a sample has no capture time of this computer's clock"));
         }
         let missing = self.newest.map_or(0, |newest| head.seq.saturating_sub(newest.saturating_add(1)));
+        let again = if self.newest == Some(head.seq) { FLAG_SAME_NUMBER } else { 0 };
         self.newest = Some(head.seq);
         let Head { offset_ns, uncertainty_ns, .. } = head;
         self.clock = Some(ClockOffset { offset_ns, uncertainty_ns });
@@ -103,7 +104,7 @@ impl Remote {
             bytes: self.frames.payload(),
             encoding,
             captured,
-            flags: head.flags,
+            flags: head.flags | again,
             width: head.width,
             height: head.height,
             lost: if missing < MOST_MISSING { missing } else { 0 },
