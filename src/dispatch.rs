@@ -93,6 +93,8 @@ pub fn refuse(error: &clap::Error) -> ExitCode {
 /// Runs a command line.
 pub fn dispatch(cli: Cli) -> ExitCode {
     let (json, command) = (cli.global.json, cli.name.clone());
+    // Without it, too, the command does what it can.
+    let _ = app::signals::outlive_large_files();
     match check_built(&cli).and_then(|()| execute(cli)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(Failure { text, code }) => {
@@ -184,7 +186,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
         }
         Command::List(args) => {
             let palette = Palette::for_output(&io::stdout());
-            reported(commands::list::list(&args, format, palette, out, &|error| {
+            reported(commands::list::list(&args, format, palette, out, &mut |error| {
                 print_warning(&format_args!("labels and notes are missing: {error}"));
             })?)
         }
@@ -405,7 +407,9 @@ fn servers(args: &RunArgs) -> Vec<Box<dyn Server>> {
     let requested: Vec<Option<Box<dyn Server>>> = Vec::from([
         #[cfg(feature = "foxglove")]
         args.foxglove_server.foxglove.map(|address| -> Box<dyn Server> {
-            Box::new(app::FoxgloveOptions { address, control: args.foxglove_server.foxglove_control })
+            let args = &args.foxglove_server;
+            let (control, origins) = (args.foxglove_control, args.foxglove_origin.clone());
+            Box::new(app::FoxgloveOptions { address, control, origins })
         }),
         #[cfg(feature = "web")]
         args.web.web.map(|address| -> Box<dyn Server> {

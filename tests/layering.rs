@@ -58,6 +58,11 @@ const LOCKS: &[&str] = &["Mutex", "RwLock", "Condvar", "ReentrantMutex", "Semaph
 const LOCK_HOMES: &[(&str, &str)] = &[
     ("bus/shared", "the handle of a loan: made, locked and dropped by one thread"),
     ("status/board", "what a screen shows: written when a state changes and twice a second, read by the screen"),
+    (
+        "foxglove/client",
+        "a client's queue: locked by thread `foxglove` alone, for a type that the library wants to share",
+    ),
+    ("devices/driver/lan/iphone/clock", "clocks of phones that are away: locked when one connects or is gone"),
     ("rig/hooks", "the hooks of an entry run one after the other"),
     ("rig/worker", "a program waits for the end of the one before"),
     (
@@ -65,6 +70,7 @@ const LOCK_HOMES: &[(&str, &str)] = &[
         "the simulated world, which its devices share, and a light that is switched for a calibration",
     ),
     ("policy/onnxruntime", "onnxruntime is loaded once, before the first chunk"),
+    ("system/fault", "injected faults, in builds with debug assertions alone"),
     ("system/panics", "messages of panics"),
     ("screens/tui", "the monitor's terminal"),
 ];

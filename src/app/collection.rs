@@ -18,6 +18,7 @@ use rapid_episode::record::{EpisodeRequest, RecordError, Recorder};
 use rapid_registry::{ModuleError, ModuleSpec};
 use rapid_status::session::{Answered, Phase, SessionRequest, SessionStatus};
 use rapid_status::{Board, EpisodeCounts, EpisodeReport, EventKind, Level, Verdict};
+use rapid_system::folder::{Folder, Links, Missing};
 use tokio::sync::mpsc::{UnboundedReceiver, UnboundedSender, unbounded_channel};
 use tokio::sync::{oneshot, watch};
 use tokio::time::timeout;
@@ -26,7 +27,7 @@ use super::AppError;
 use super::requests::Reply;
 use super::stage::join;
 use crate::session::journal::{self, Journal, Plan, SessionFile};
-use crate::session::keeper::{Keeper, Operation, Outcome, Pending};
+use crate::session::keeper::{Keeper, Operation, Outcome, Pending, Undone};
 use crate::session::{Answer, Effect, Session};
 
 /// The last samples of an episode have this long to arrive: the longest `latency` of a device is a second.
@@ -106,9 +107,46 @@ pub(super) struct Collection {
     /// The session has a file. A run that records one episode by itself leaves that episode and nothing beside it, unless
     /// something is requested of it.
     is_kept: bool,
-    /// When the session began whose file is there but which is not continued. It is archived before this session's is
-    /// written: a run that records nothing changes nothing.
-    superseded: Option<String>,
+    /// An order whose outcome is not known yet.
+    ordered: Option<Ordered>,
+    /// The folder, once it is known to be there.
+    folder: Option<Folder>,
+    /// What was never saved.
+    lost: Option<String>,
+}
+
+/// What the keeper says of an order.
+type KeeperAnswer = oneshot::Receiver<Result<(), Undone>>;
+
+/// An order that the keeper carries out, and what is to be said and done afterwards.
+struct Ordered {
+    outcome: KeeperAnswer,
+    /// What is the case again if it is not carried out.
+    before: (Session, Vec<String>),
+    text: String,
+    /// A mark of the episode in progress, made then.
+    mark: Option<(Stamp, String)>,
+    reply: Reply,
+}
+
+/// Whether this changes only what is noted, planned or kept: it is carried out whole, or not at all. Whatever begins or ends
+/// an episode does so at once, whether or not the disk lets it be noted.
+fn is_order(request: &SessionRequest, phase: Phase) -> bool {
+    match request {
+        SessionRequest::Discard { episode } => episode.is_some() || !matches!(phase, Phase::Recording | Phase::Ending),
+        SessionRequest::Undo
+        | SessionRequest::Mark { .. }
+        | SessionRequest::Label { .. }
+        | SessionRequest::Note { .. }
+        | SessionRequest::Plan { .. }
+        | SessionRequest::EndSession => true,
+        SessionRequest::Toggle
+        | SessionRequest::Start
+        | SessionRequest::Stop
+        | SessionRequest::Next
+        | SessionRequest::Redo
+        | SessionRequest::Show => false,
+    }
 }
 
 impl Collection {
@@ -124,14 +162,13 @@ impl Collection {
         board: &Arc<Board>,
         mountable: watch::Receiver<Vec<ModuleSpec>>,
     ) -> Result<Self, AppError> {
-        let (journal, before, error) = Journal::open(&episode.out);
+        let (journal, before, error) = Journal::open(&episode.out, &plan.task);
         if let Some(error) = error {
             tracing::warn!(%error, "an earlier session is not continued");
         }
-        let earlier = before.as_ref().map(|before| before.begun.clone());
         let names = journal::sessions(&episode.out).0.into_iter().flat_map(SessionFile::into_names).collect();
-        let (session, is_new) = Session::new(&episode.out, plan, before, names, rfc3339(realtime_ns()));
-        let (keeper, outcomes) = Keeper::start(&episode.out, journal)?;
+        let (session, _) = Session::new(&episode.out, plan, before, names, rfc3339(realtime_ns()));
+        let (keeper, outcomes) = Keeper::start(journal)?;
         let (to_found, found) = unbounded_channel();
         let collection = Self {
             board: Arc::clone(board),
@@ -149,7 +186,9 @@ impl Collection {
             answer: None,
             episodes: EpisodeCounts::default(),
             is_kept,
-            superseded: earlier.filter(|_| is_new),
+            ordered: None,
+            folder: None,
+            lost: None,
         };
         collection.show();
         Ok(collection)
@@ -205,6 +244,7 @@ impl Collection {
         at: Stamp,
         reply: Reply,
     ) -> Result<(), RecordError> {
+        self.settle().await;
         let is_shown = *request != SessionRequest::Show;
         let replaces = self.session.newest().filter(|_| *request == SessionRequest::Redo).map(str::to_owned);
         self.is_kept |= is_shown;
@@ -220,6 +260,13 @@ impl Collection {
                 return Ok(());
             }
         };
+        if is_order(request, self.session.phase()) {
+            // What was decided before is on the disk by then, or is known not to be.
+            let earlier = self.keeper.order(Vec::new());
+            let _ = earlier.await;
+            self.take_outcomes();
+        }
+        let before = (self.session.clone(), self.episode.modules.clone());
         match self.session.request(request, at) {
             Ok((answer, effects)) => {
                 self.episode.modules = mounted;
@@ -227,6 +274,12 @@ impl Collection {
                     Answer::Now(mut text) => {
                         if matches!(request, SessionRequest::Plan { .. }) && !self.episode.modules.is_empty() {
                             text = format!("{text}, with {}", self.episode.modules.join(", "));
+                        }
+                        if is_order(request, before.0.phase()) {
+                            let (outcome, mark) = self.order(effects, at);
+                            self.ordered = Some(Ordered { outcome, before, text, mark, reply });
+                            self.settle().await;
+                            return Ok(());
                         }
                         let to = reply.into_iter().collect();
                         Some(Pending { text, is_done: false, replaces: None, is_shown, to })
@@ -247,6 +300,50 @@ impl Collection {
                 self.show();
                 Ok(())
             }
+        }
+    }
+
+    /// Hands an order made at `at` to the keeper; its outcome, and the mark to be made then.
+    fn order(&mut self, effects: Vec<Effect>, at: Stamp) -> (KeeperAnswer, Option<(Stamp, String)>) {
+        let mut mark = None;
+        for effect in effects {
+            match effect {
+                Effect::Mark(text) => mark = Some((at, text)),
+                effect => self.change(effect),
+            }
+        }
+        (self.keeper.order(std::mem::take(&mut self.operations)), mark)
+    }
+
+    /// Waits until the order in progress, if there is one, is carried out or not, and answers it. Cancel-safe.
+    async fn settle(&mut self) {
+        let Some(ordered) = &mut self.ordered else { return };
+        let outcome = (&mut ordered.outcome).await;
+        let Some(Ordered { before, text, mark, reply, .. }) = self.ordered.take() else { return };
+        self.take_outcomes();
+        let ended = || Undone { why: "thread `session` has ended: restart this run".to_owned(), stands: false };
+        let answer = match outcome.unwrap_or_else(|_| Err(ended())) {
+            Ok(()) => {
+                if let Some((at, text)) = mark {
+                    self.board.announce_at(at, EventKind::Mark { text });
+                }
+                Ok(text)
+            }
+            Err(Undone { why, stands }) => {
+                if !stands {
+                    (self.session, self.episode.modules) = before;
+                }
+                Err(why)
+            }
+        };
+        self.answer(answer, reply);
+        self.show();
+    }
+
+    /// Takes what the keeper has reported so far.
+    fn take_outcomes(&mut self) {
+        while let Ok(outcome) = self.outcomes.try_recv() {
+            self.apply_outcome(outcome);
         }
     }
 
@@ -318,6 +415,11 @@ impl Collection {
                 self.fail(format!("{file} was not moved: {why}"));
             }
             Outcome::Failed(why) => self.fail(why),
+            Outcome::Saved => {
+                let text = "the session is saved again".to_owned();
+                self.board.announce(EventKind::Log { level: Level::Info, text });
+            }
+            Outcome::Lost(why) => self.lost = Some(why),
             Outcome::Closed(closed) => {
                 self.session.closed(closed.is_ok(), rfc3339(realtime_ns()));
                 if let Err(why) = closed {
@@ -366,16 +468,13 @@ impl Collection {
         match effect {
             Effect::Begin => {}
             Effect::Save if !self.is_kept => {}
-            Effect::Save => {
-                self.archive_superseded();
-                self.operations.push(Operation::Save(self.session.file().clone()));
-            }
+            Effect::Save => self.operations.push(Operation::Save(self.session.file().clone())),
+            Effect::Note(file, before, changes) => self.operations.push(Operation::Note(file, before, changes)),
             Effect::End(at) => self.recorder.end(at),
             Effect::Discard(file) => self.operations.push(Operation::Discard(file)),
             Effect::Restore(file) => self.operations.push(Operation::Restore(file)),
             Effect::Mark(text) => self.board.announce(EventKind::Mark { text }),
             Effect::Close(gone) => {
-                self.archive_superseded();
                 self.operations.push(Operation::Close(self.session.at_end(rfc3339(realtime_ns())), gone));
             }
         }
@@ -397,13 +496,6 @@ impl Collection {
         }
     }
 
-    /// Before this session's file is written for the first time.
-    fn archive_superseded(&mut self) {
-        if let Some(begun) = self.superseded.take() {
-            self.operations.push(Operation::Archive(begun));
-        }
-    }
-
     async fn begin(&mut self) -> Result<(), RecordError> {
         let plan = self.session.plan();
         let request = EpisodeRequest {
@@ -412,7 +504,15 @@ impl Collection {
             taken: self.session.taken(),
             ..self.episode.clone()
         };
-        let started = self.recorder.start(request).await;
+        let moved = self.folder.as_ref().and_then(Folder::moved_to);
+        let started = match moved {
+            // The session stays with its episodes.
+            Some(to) => Err(RecordError::Moved { from: self.episode.out.clone(), to }),
+            None => self.recorder.start(request).await,
+        };
+        if started.is_ok() && self.folder.as_ref().is_none_or(Folder::is_removed) {
+            self.folder = Folder::open(&self.episode.out, Links::Own, Missing::Refused).ok();
+        }
         self.board.set_not_started(started.as_ref().err().map(ToString::to_string));
         let begun = rfc3339(realtime_ns());
         for effect in self.session.began(started.as_deref().ok(), begun, Stamp::now()) {
@@ -461,6 +561,7 @@ impl Collection {
 
     /// Ends the episode in progress, if there is one, waits until its file is closed, and notes it; no other begins.
     pub(super) async fn finish_episode(&mut self) -> Option<EpisodeReport> {
+        self.settle().await;
         let end = self.recorder.stop().await?;
         let (effects, answer) = self.end_noted(&end);
         for effect in effects {
@@ -473,8 +574,9 @@ impl Collection {
     /// Writes the summary and waits until everything about the session is on the disk.
     ///
     /// # Errors
-    /// When the keeper panicked.
+    /// When the keeper panicked, or something was never saved.
     pub(super) async fn close(&mut self) -> Result<(), AppError> {
+        self.settle().await;
         if self.is_kept && !self.session.file().episodes.is_empty() {
             self.keeper.request(vec![Operation::Summarise(self.session.file().clone())], None);
         }
@@ -485,7 +587,7 @@ impl Collection {
         while let Some(outcome) = self.outcomes.recv().await {
             self.apply_outcome(outcome);
         }
-        outcome
+        outcome.and(self.lost.take().map_or(Ok(()), |why| Err(AppError::Unsaved(why))))
     }
 }
 

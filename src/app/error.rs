@@ -63,6 +63,9 @@ pub enum AppError {
         /// Why.
         reason: String,
     },
+    /// The session's file lacks what was collected.
+    #[error("{0}; the episodes themselves are there: `rapid list` shows them, and `rapid label` labels them")]
+    Unsaved(String),
     /// Other programs could not stop the actuator.
     #[error("orders to the actuator cannot be received: {0}")]
     Orders(#[source] io::Error),

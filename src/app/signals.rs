@@ -1,15 +1,23 @@
-//! Signals that end a run.
+//! Signals that end a run, and one that must not.
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 /// SIGINT, SIGTERM, SIGQUIT, and SIGHUP for a terminal that was closed: all of them end the run.
 ///
-/// Two that would end the process immediately are handled: SIGPIPE by Rust's runtime, and SIGXFSZ here, so that a write
-/// beyond the limit for files (`ulimit -f`) is an error like any other.
 pub(crate) struct Signals {
     ends: [Signal; 4],
-    _too_large: Signal,
     received: u32,
+}
+
+/// Makes a write beyond the limit for files (`ulimit -f`) an error like any other, in this process and until it ends: SIGXFSZ
+/// would end it. A handler does it, which programs that are started do not inherit. SIGPIPE is Rust's runtime's.
+///
+/// # Errors
+/// When the system provides no means.
+pub(crate) fn outlive_large_files() -> std::io::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build()?;
+    // The handler stays when what it returns is dropped.
+    runtime.block_on(async { signal(SignalKind::from_raw(libc::SIGXFSZ)).map(drop) })
 }
 
 impl Signals {
@@ -21,7 +29,6 @@ impl Signals {
                 signal(SignalKind::quit())?,
                 signal(SignalKind::hangup())?,
             ],
-            _too_large: signal(SignalKind::from_raw(libc::SIGXFSZ))?,
             received: 0,
         })
     }

@@ -4,13 +4,16 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum, ValueHint};
 
+use super::list::{LabelFilter, VerdictArg};
+
 pub(super) const EXPORT: &str = "\
 A row is a tick of the frame index (/rapid/frame), with the sample of each sensor that belongs to it: pictures as \
 observation.images.NAME, JPEGs byte for byte and others as PNG, or with --pictures av1 as a video; numbers as observation.state; /action as action; and \
 rapid.mask, rapid.plugged, rapid.valid, rapid.age, rapid.time_ns. What is absent is black or zero, with its mask.
 
 Episodes that DIR has already are skipped, new ones are appended. An episode that does not fit is left out and named; so \
-is one that is BAD. Interrupted, DIR has the episodes so far, and the same command continues.
+is one that is BAD. --label and --verdict select as those of `rapid list` do; label and note of each episode are in \
+meta/episodes. Interrupted, DIR has the episodes so far, and the same command continues.
 
 Examples:
   rapid export episodes --to lerobot --out place-block
@@ -18,7 +21,7 @@ Examples:
   rapid export episodes --to lerobot --out small --pictures av1
   rapid export monday tuesday/*.mcap --to lerobot --out both --state motor_state,force
   rapid export episodes --to lerobot --out own --state arm.position,phone --action phone,grip.0
-  rapid export $(cat training.txt) --to lerobot --out good        # of `rapid list`
+  rapid export episodes --to lerobot --out good --label success --verdict good
 
 Exit code: 0 if DIR has at least one of the episodes, otherwise 1; 1 also if --verify finds a difference or it is \
 interrupted.";
@@ -35,8 +38,14 @@ pub struct ExportArgs {
     /// Folder of the dataset: a new one, or one to append to
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     pub out: PathBuf,
+    /// Only those with this verdict, also bad; repeatable, or separated by commas [default: good,suspect]
+    #[arg(long, value_name = "VERDICT", value_delimiter = ',', ignore_case = true)]
+    pub verdict: Vec<VerdictArg>,
+    /// Only those with this label; repeatable, or separated by commas
+    #[arg(long, value_name = "LABEL", value_delimiter = ',')]
+    pub label: Vec<LabelFilter>,
     /// Also those that are BAD
-    #[arg(long)]
+    #[arg(long, conflicts_with = "verdict")]
     pub include_bad: bool,
     /// Numbers of observation.state: NAME, NAME.0, NAME.0-5, NAME.position [default: as in DIR, else as in the episode's
     /// registry, else all]

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum, ValueHint};
 use rapid_core::time::Zone;
 use rapid_status::Grade;
+use rapid_status::session::Label;
 
 pub(super) const LIST: &str = "\
 Every file is read completely and judged again, and the labels and notes of its session are shown beside it. \
@@ -93,6 +94,17 @@ pub enum LabelFilter {
     Failure,
     /// No label was given.
     None,
+}
+
+impl LabelFilter {
+    /// The word for what an episode has.
+    pub const fn of(label: Option<Label>) -> Self {
+        match label {
+            Some(Label::Success) => Self::Success,
+            Some(Label::Failure) => Self::Failure,
+            None => Self::None,
+        }
+    }
 }
 
 /// By what the lines are sorted.

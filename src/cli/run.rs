@@ -77,7 +77,7 @@ pub struct RunArgs {
 }
 
 /// What other programs see live.
-#[derive(Debug, Clone, Copy, Args)]
+#[derive(Debug, Clone, Args)]
 pub struct FoxgloveArgs {
     /// Show all topics live in Foxglove, as they are recorded [default address: 127.0.0.1:8765]
     ///
@@ -87,10 +87,13 @@ pub struct FoxgloveArgs {
     pub foxglove: Option<SocketAddr>,
     /// Let Foxglove begin and end episodes, arm and disarm
     ///
-    /// There is no password: every program and every user that reaches the port may do so, and so may web pages that are
-    /// open in a browser on this machine.
+    /// There is no password: every program and every user that reaches the port may do so. Web pages may not, but for the
+    /// app's own and those of --foxglove-origin.
     #[arg(long, requires = "foxglove", hide_short_help = true)]
     pub foxglove_control: bool,
+    /// Let pages of this site connect too: scheme, host and port, as `http://localhost:8080`; may be repeated
+    #[arg(long, value_name = "URL", requires = "foxglove", value_parser = origin, hide_short_help = true)]
+    pub foxglove_origin: Vec<String>,
 }
 
 /// The page for a phone.
@@ -139,6 +142,18 @@ pub struct TaskArgs {
 
 fn foxglove_address(text: &str) -> Result<SocketAddr, String> {
     address(text, 8765)
+}
+
+/// The origin of a page, as browsers send it: scheme and host, and a port that is not the scheme's.
+fn origin(text: &str) -> Result<String, String> {
+    let is_host = |host: &str| !host.is_empty() && !host.contains(['/', '?', '#', ' ', '@']);
+    let origin = text.strip_suffix('/').unwrap_or(text).to_ascii_lowercase();
+    let host = origin.strip_prefix("http://").or_else(|| origin.strip_prefix("https://"));
+    if host.is_some_and(is_host) {
+        Ok(origin)
+    } else {
+        Err("write scheme and host of the page: http://localhost:8080".to_owned())
+    }
 }
 
 fn web_address(text: &str) -> Result<SocketAddr, String> {

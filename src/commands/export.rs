@@ -15,16 +15,18 @@ use rapid_core::text;
 use rapid_episode::record::inspect::{self, ReadError};
 use rapid_episode::sha256;
 use rapid_export::{
-    self, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, Pictures, Position, Refusal, SetError,
-    Survey, Unfit, Verified,
+    self, Codec, DataSet, Difference, Encoded, Ends, Features, Ffmpeg, Known, NotExported, Pictures, Position, Refusal,
+    SetError, Survey, Unfit, Verdicts, Verified,
 };
 use rapid_registry::ExportSpec;
 use rapid_status::Grade;
-use serde::Serialize;
+use rapid_status::session::Notes;
+use serde::{Serialize, Serializer};
 
 use super::progress::Work;
 use super::{Format, json_line};
-use crate::cli::{ExportArgs, PictureForm};
+use crate::cli::{ExportArgs, LabelFilter, PictureForm, VerdictArg};
+use crate::session::noted::noted;
 
 /// Why the export ended.
 #[derive(Debug, thiserror::Error)]
@@ -41,6 +43,9 @@ pub enum ExportError {
     /// No episode fits.
     #[error("nothing exported: none of {0} can be, for the reasons above")]
     Nothing(String),
+    /// No episode is selected.
+    #[error("nothing exported: none of {0} has what --label and --verdict select")]
+    NotSelected(String),
     /// The user interrupted.
     #[error("interrupted; {} has {episodes}, and the same command continues", out.display())]
     Interrupted {
@@ -92,8 +97,13 @@ struct Summary<'a> {
     left_out: usize,
     /// How many of those are BAD.
     bad: usize,
+    /// Episodes that `--label` and `--verdict` do not select.
+    not_selected: usize,
     /// Samples of exported episodes that belong to a frame and cannot be used.
     unusable: u64,
+    /// What exported episodes have and the dataset does not, and in how many of them.
+    #[serde(serialize_with = "listed")]
+    not_exported: BTreeMap<NotExported, usize>,
     /// Episodes and frames of the set.
     episodes: usize,
     frames: u64,
@@ -112,6 +122,8 @@ impl<'a> Summary<'a> {
             already: 0,
             left_out: 0,
             bad: 0,
+            not_selected: 0,
+            not_exported: BTreeMap::new(),
             unusable: 0,
             episodes: 0,
             frames: 0,
@@ -120,6 +132,17 @@ impl<'a> Summary<'a> {
             psnr_db: None,
         }
     }
+}
+
+/// A list in JSON of what the dataset does not have.
+fn listed<S: Serializer>(not_exported: &BTreeMap<NotExported, usize>, to: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Line<'a> {
+        #[serde(flatten)]
+        what: &'a NotExported,
+        episodes: usize,
+    }
+    to.collect_seq(not_exported.iter().map(|(what, episodes)| Line { what, episodes: *episodes }))
 }
 
 /// A line about a difference.
@@ -160,7 +183,18 @@ pub fn export(
         }
     };
     let mut report = Report { format, out, err, summary: Summary::new(&args.out) };
-    let found = found(&files, args, &set, stop, &mut report)?;
+    let noted = noted_of(&files, &mut report)?;
+    let selected: Vec<PathBuf> = files.iter().filter(|file| has_label(args, noted.get(*file))).cloned().collect();
+    report.summary.not_selected = files.len() - selected.len();
+    let mut found = found(&selected, args, &set, stop, &mut report)?;
+    for (number, file) in &found.already {
+        if let Some(noted) = noted.get(file) {
+            set.note(*number, noted)?;
+        }
+    }
+    for episode in &mut found.new {
+        episode.noted = noted.get(&episode.file).cloned().unwrap_or_default();
+    }
     let mut sources = found.already;
     let fitting = fitting(found.new, args, pictures, &set, &mut report)?;
     append(&fitting, args.jobs, &mut set, ffmpeg.as_ref(), stop, &mut report, &mut sources)?;
@@ -173,9 +207,25 @@ pub fn export(
     report.summary.frames = set.rows();
     report.end()?;
     if sources.is_empty() {
-        return Err(ExportError::Nothing(text::counted(files.len() as u64, "episode")));
+        let episodes = text::counted(files.len() as u64, "episode");
+        let is_selected = report.summary.not_selected < files.len();
+        return Err(if is_selected { ExportError::Nothing(episodes) } else { ExportError::NotSelected(episodes) });
     }
     Ok(report.summary.differences == 0)
+}
+
+/// What people noted about these files.
+fn noted_of(files: &[PathBuf], report: &mut Report<'_>) -> io::Result<BTreeMap<PathBuf, Notes>> {
+    let mut warnings = Vec::new();
+    let noted = noted(files, &mut |error| warnings.push(format!("warning: {error}")));
+    for warning in warnings {
+        writeln!(report.err, "{}", text::plain(&warning))?;
+    }
+    Ok(noted)
+}
+
+fn has_label(args: &ExportArgs, noted: Option<&Notes>) -> bool {
+    args.label.is_empty() || args.label.contains(&LabelFilter::of(noted.and_then(|noted| noted.label)))
 }
 
 fn pictures(form: PictureForm) -> Pictures {
@@ -233,7 +283,7 @@ fn append(
         let taken = match appended {
             Ok(number) => {
                 sources.insert(number, episode.file.clone());
-                report.exported(episode, number).map_err(ExportError::from)
+                report.exported(episode, features, number).map_err(ExportError::from)
             }
             Err(SetError::Refused(Refusal::Interrupted)) => Ok(()),
             Err(SetError::Refused(refusal)) => report.left_out(&episode.file, &refusal).map_err(ExportError::from),
@@ -270,6 +320,12 @@ fn found(
         Already(usize),
         New(Box<Survey>),
     }
+    let grades: Vec<Grade> = args.verdict.iter().copied().map(VerdictArg::grade).collect();
+    let verdicts = match (args.include_bad, grades.as_slice()) {
+        (true, _) => Verdicts::All,
+        (false, []) => Verdicts::Fit,
+        (false, grades) => Verdicts::Only(grades),
+    };
     let read = |file: &Path| {
         if stop.load(Ordering::Relaxed) {
             return Err(Refusal::Interrupted);
@@ -277,9 +333,7 @@ fn found(
         let sha256 = sha256(file)?;
         match set.find(&sha256) {
             Some(number) => Ok(Read::Already(number)),
-            None => {
-                rapid_export::survey(file, sha256, args.include_bad, stop).map(|survey| Read::New(Box::new(survey)))
-            }
+            None => rapid_export::survey(file, sha256, verdicts, stop).map(|survey| Read::New(Box::new(survey))),
         }
     };
     let mut found = SurveyedFiles { already: BTreeMap::new(), new: Vec::new() };
@@ -303,6 +357,7 @@ fn found(
                     }
                 }
                 Err(Refusal::Interrupted) => {}
+                Err(Refusal::NotSelected(_)) => report.summary.not_selected += 1,
                 Err(refusal) => report.left_out(file, &refusal)?,
             }
             Ok::<_, ExportError>(())
@@ -386,8 +441,11 @@ struct Report<'a> {
 }
 
 impl Report<'_> {
-    fn exported(&mut self, episode: &Survey, number: usize) -> io::Result<()> {
+    fn exported(&mut self, episode: &Survey, features: &Features, number: usize) -> io::Result<()> {
         self.summary.exported += 1;
+        for what in features.not_exported(episode) {
+            *self.summary.not_exported.entry(what).or_default() += 1;
+        }
         let Survey { file, rows, unusable, unfit, grade, .. } = episode;
         self.summary.unusable += unusable;
         let mut line = format!("{}: episode {number}, {}", file.display(), text::counted(*rows as u64, "frame"));
@@ -486,12 +544,17 @@ impl Report<'_> {
         if self.format == Format::Json {
             return writeln!(self.out, "{}", json_line("export", &self.summary)?);
         }
-        let Summary { out, exported, already, left_out, bad, unusable, .. } = &self.summary;
+        for (NotExported { name, reason }, episodes) in &self.summary.not_exported {
+            let episodes = text::counted(*episodes as u64, "episode");
+            writeln!(self.out, "{}", text::plain(&format!("not in the dataset: {name} of {episodes}: {reason}")))?;
+        }
+        let Summary { out, exported, already, left_out, bad, not_selected, unusable, .. } = &self.summary;
         let Summary { episodes, frames, verified, differences, psnr_db, .. } = &self.summary;
         let (episodes, frames) = (text::counted(*episodes as u64, "episode"), text::counted(*frames, "frame"));
         let bad = if *bad > 0 { format!(" ({bad} BAD)") } else { String::new() };
+        let not_selected = if *not_selected > 0 { format!(", {not_selected} not selected") } else { String::new() };
         let mut line = format!(
-            "{exported} exported, {already} already there, {left_out} left out{bad}; {}: {episodes}, {frames}",
+            "{exported} exported, {already} already there, {left_out} left out{bad}{not_selected}; {}: {episodes}, {frames}",
             out.display()
         );
         if *unusable > 0 {

@@ -1,13 +1,13 @@
 //! `rapid list`: recorded episodes with their verdicts, labels and notes, filtered and sorted.
 //!
 //! The verdict is that of the file as it is now, not the one noted when it was recorded; label and note are those of
-//! the session's file beside it.
+//! the file beside it, or of a session ([`crate::session::noted`]).
 
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::Duration;
 
 use rapid_core::text;
@@ -15,12 +15,12 @@ use rapid_core::time::{Zone, rfc3339};
 use rapid_episode::record::inspect::{self, Judgement, Listed, ReadError};
 use rapid_status::Grade;
 use rapid_status::palette::Palette;
-use rapid_status::session::{EpisodeEntry, Label};
+use rapid_status::session::{Label, Notes};
 use serde::Serialize;
 
 use super::{CommandStatus, Format, json_line, progress};
 use crate::cli::{LabelFilter, ListArgs, SortArg};
-use crate::session::journal::{self, JournalError};
+use crate::session::noted::{NotedError, noted};
 
 /// Why there is no list.
 #[derive(Debug, thiserror::Error)]
@@ -49,20 +49,14 @@ struct Row {
     /// Beginning, RFC 3339, UTC.
     #[serde(skip_serializing_if = "Option::is_none")]
     begun: Option<String>,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    label: Option<Label>,
-    #[serde(skip_serializing_if = "String::is_empty")]
-    label_reason: String,
-    #[serde(skip_serializing_if = "String::is_empty")]
-    note: String,
+    #[serde(flatten)]
+    notes: Notes,
 }
 
 impl Row {
-    fn new(listed: Listed, noted: Option<EpisodeEntry>) -> Self {
-        let (label, label_reason, note) =
-            noted.map(|entry| (entry.label, entry.label_reason, entry.note)).unwrap_or_default();
+    fn new(listed: Listed, notes: Notes) -> Self {
         let begun = (listed.begin_ns > 0).then(|| rfc3339(listed.begin_ns));
-        Self { listed, begun, label, label_reason, note }
+        Self { listed, begun, notes }
     }
 
     /// The first reason for its verdict, and all that was noted.
@@ -70,10 +64,10 @@ impl Row {
         let reasons = self.listed.verdict.reasons();
         let first = reasons.first().copied().unwrap_or_default();
         let more = if reasons.len() > 1 { format!("and {} more", reasons.len() - 1) } else { String::new() };
-        let label = if self.label_reason.is_empty() {
+        let label = if self.notes.label_reason.is_empty() {
             String::new()
         } else {
-            format!("{}: {}", self.label.map_or("label", Label::word), self.label_reason)
+            format!("{}: {}", self.notes.label.map_or("label", Label::word), self.notes.label_reason)
         };
         let verdict = self.listed.verdict.verdict();
         let away = verdict.and_then(|verdict| verdict.sensors.as_ref()).map_or(&[][..], |sensors| &sensors.away);
@@ -83,7 +77,7 @@ impl Row {
         // The reason names it already.
         let replays: Vec<String> = replays.filter(|replay| !first.starts_with(replay.as_str())).collect();
         let tags: Vec<String> = self.listed.tags.iter().map(|(key, value)| format!("{key}={value}")).collect();
-        let parts = [&tags.join(" "), first, &more, &replays.join(", "), &away.join(", "), &label, &self.note];
+        let parts = [&tags.join(" "), first, &more, &replays.join(", "), &away.join(", "), &label, &self.notes.note];
         let parts: Vec<&str> = parts.into_iter().filter(|part| !part.is_empty()).collect();
         text::plain(&parts.join("; ")).into_owned()
     }
@@ -117,14 +111,9 @@ impl<'a> Filter<'a> {
             return true;
         }
         let args = self.args;
-        let label = match row.label {
-            Some(Label::Success) => LabelFilter::Success,
-            Some(Label::Failure) => LabelFilter::Failure,
-            None => LabelFilter::None,
-        };
         let has = |name: &String| recorded.contains(name);
         (args.verdict.is_empty() || args.verdict.iter().any(|wanted| Some(wanted.grade()) == verdict.grade()))
-            && (args.label.is_empty() || args.label.contains(&label))
+            && (args.label.is_empty() || args.label.contains(&LabelFilter::of(row.notes.label)))
             && self.task.as_ref().is_none_or(|part| task.to_lowercase().contains(part))
             && args.tag.iter().all(|(key, value)| tags.get(key) == Some(value))
             && args.sensor.iter().all(has)
@@ -143,7 +132,7 @@ pub fn list(
     format: Format,
     palette: Palette,
     out: &mut dyn Write,
-    warn: &dyn Fn(&JournalError),
+    warn: &mut dyn FnMut(&NotedError),
 ) -> Result<CommandStatus, ListError> {
     let zone = args.zone();
     let filter = Filter::new(args, &zone)?;
@@ -153,10 +142,10 @@ pub fn list(
     }
     let files = inspect::episodes(&args.paths)?;
     let folders: BTreeSet<&Path> = files.iter().filter_map(|file| file.parent()).collect();
-    let mut noted = noted(&folders, warn);
+    let mut noted = noted(&files, warn);
     let mut rows = Vec::new();
     progress::each(&files, inspect::list, |file, listed| {
-        rows.push(Row::new(listed, noted.remove(file)));
+        rows.push(Row::new(listed, noted.remove(file).unwrap_or_default()));
         Ok::<_, ListError>(())
     })?;
     let all = rows.len();
@@ -168,22 +157,6 @@ pub fn list(
     }
     let unreadable = rows.iter().any(|row| matches!(row.listed.verdict, Judgement::Unreadable(_)));
     Ok(if unreadable { CommandStatus::BadConfiguration } else { CommandStatus::Done })
-}
-
-/// What was noted about the files of these folders, the latest session last.
-pub(super) fn noted(folders: &BTreeSet<&Path>, warn: &dyn Fn(&JournalError)) -> BTreeMap<PathBuf, EpisodeEntry> {
-    let mut noted = BTreeMap::new();
-    for folder in folders {
-        let here = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
-        let (sessions, errors) = journal::sessions(here);
-        for error in errors {
-            warn(&error);
-        }
-        for entry in sessions.into_iter().flat_map(|session| session.episodes).filter(|entry| !entry.discarded) {
-            noted.insert(folder.join(&entry.file), entry);
-        }
-    }
-    noted
 }
 
 fn sort(rows: &mut [Row], by: SortArg) {
@@ -227,7 +200,7 @@ fn write_table(
 fn line(row: &Row, name: &str, zone: &Zone, palette: Palette) -> String {
     let Listed { verdict, seconds, bytes, begin_ns, .. } = &row.listed;
     let begun = if *begin_ns > 0 { zone.minute(*begin_ns) } else { String::new() };
-    let label = row.label.map_or("", Label::word);
+    let label = row.notes.label.map_or("", Label::word);
     let sensors = verdict.verdict().and_then(|verdict| verdict.sensors.as_ref());
     let sensors = sensors.map(|sensors| format!("{}/{}", sensors.throughout(), sensors.registered)).unwrap_or_default();
     let seconds = if row.listed.error.is_none() { format!("{seconds:.1} s") } else { String::new() };
@@ -243,7 +216,7 @@ fn line(row: &Row, name: &str, zone: &Zone, palette: Palette) -> String {
 /// How many, how long, how large, with which verdicts and labels.
 fn totals(rows: &[Row], all: usize, zone: &Zone) -> String {
     let count = |grade| rows.iter().filter(|row| row.listed.verdict.grade() == Some(grade)).count();
-    let labels = |label| rows.iter().filter(|row| row.label == Some(label)).count();
+    let labels = |label| rows.iter().filter(|row| row.notes.label == Some(label)).count();
     let seconds = rows.iter().map(|row| row.listed.seconds.max(0.0)).sum::<f64>();
     let length = Duration::try_from_secs_f64(seconds).unwrap_or_default();
     let bytes: u64 = rows.iter().map(|row| row.listed.bytes).sum();

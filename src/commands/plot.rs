@@ -2,7 +2,7 @@
 //!
 //! Invariant: only a picture that this command made is replaced.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
@@ -13,7 +13,8 @@ use rapid_episode::record::inspect::{self, Judgement, ReadError};
 use rapid_system::folder::{Folder, FolderError, Links, Missing, Sync};
 use serde::Serialize;
 
-use super::{CommandStatus, Format, json_line, list};
+use super::{CommandStatus, Format, json_line};
+use crate::session::noted::noted;
 
 /// Anyone may read a picture whose episode may be read.
 const MODE: u32 = 0o644;
@@ -124,9 +125,8 @@ pub fn plot(
             }
         }
     }
-    let folders: BTreeSet<&Path> = files.iter().filter_map(|file| file.parent()).collect();
     // A picture without what people noted is one too; `rapid list` reports a session that cannot be read.
-    let noted = list::noted(&folders, &|_| {});
+    let noted = noted(&files, &mut |_| {});
     if files.is_empty() && matches!(format, Format::Text) {
         writeln!(err, "no episodes in {}", text::plain(&folder_names(paths)))?;
     }

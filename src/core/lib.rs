@@ -8,6 +8,7 @@
 
 pub mod action;
 pub mod bell;
+pub mod capture;
 pub mod clip;
 pub mod interlock;
 pub mod mask;
@@ -20,6 +21,7 @@ pub mod random;
 pub mod remote;
 pub mod rotation;
 pub mod sample;
+pub mod site;
 pub mod sync;
 pub mod text;
 pub mod time;

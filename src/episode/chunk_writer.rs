@@ -29,12 +29,20 @@ const REPEATED: (u64, u64) = (16 << 20, 8);
 const HEAD: u64 = 9;
 /// Bytes of a message before its data.
 const MESSAGE: usize = 22;
+/// Bytes, at most, in an index: of a message, of a channel of a chunk, of any other record beside its name.
+const INDEXED: (u64, u64, u64) = (16, 32, 256);
+/// Bytes, at most, of a summary without indexes and definitions.
+const SUMMARY: u64 = 4 << 10;
 
 pub(crate) struct ChunkWriter<S: Write> {
     writer: Writer<NoSeek<BufWriter<S>>>,
     own: Option<Own>,
     /// Bytes of records in the open chunk, if there is one.
     open: u64,
+    /// Bytes, at most, of the index of the open chunk, and of the summary.
+    index: u64,
+    summary: u64,
+    channels: u64,
     /// Remaining bytes for definitions in chunks; beyond them a chunk only names the episode.
     spare: u64,
 }
@@ -52,7 +60,15 @@ impl<S: Sink> ChunkWriter<S> {
             .library(concat!("rapid/", env!("CARGO_PKG_VERSION")));
         let sink = NoSeek::new(BufWriter::with_capacity(BUFFER_BYTES, sink));
         let writer = Writer::with_options(sink, options).map_err(io_error)?;
-        Ok(Self { writer, own: episode.map(Own::new), open: 0, spare: REPEATED.0 })
+        Ok(Self {
+            writer,
+            own: episode.map(Own::new),
+            open: 0,
+            index: 0,
+            summary: SUMMARY,
+            channels: 0,
+            spare: REPEATED.0,
+        })
     }
 
     /// Makes every later chunk name `episode`, unless they already do or a channel is defined.
@@ -78,7 +94,21 @@ impl<S: Sink> ChunkWriter<S> {
         Ok(())
     }
 
+    /// The open chunk, if there is one, ends.
+    fn close(&mut self) {
+        self.summary += if self.open > 0 { INDEXED.2 + INDEXED.1 * self.channels } else { 0 };
+        (self.open, self.index) = (0, 0);
+    }
+
+    /// Bytes, at most, that the sink does not have yet, and that the end of the file adds.
+    pub(crate) fn outstanding(&self) -> u64 {
+        let chunk = self.open + self.index + INDEXED.2 + INDEXED.1 * self.channels;
+        BUFFER_BYTES as u64 + chunk + self.summary
+    }
+
     fn define(&mut self, opcode: u8, record: &[u8]) {
+        // The summary has it again.
+        self.summary += HEAD + record.len() as u64;
         if let Some(own) = &mut self.own {
             own.define(opcode, record);
         }
@@ -114,6 +144,7 @@ impl<S: Sink> ChunkWriter<S> {
             None => self.writer.add_channel(schema, topic, encoding, metadata)?,
         };
         number(&mut record, id);
+        self.channels += 1;
         self.define(op::CHANNEL, &record);
         Ok(id)
     }
@@ -121,6 +152,7 @@ impl<S: Sink> ChunkWriter<S> {
     /// Writes a message on a channel that was added.
     pub(crate) fn message(&mut self, header: &MessageHeader, data: &[u8]) -> Result<(), McapError> {
         self.room(MESSAGE + data.len())?;
+        self.index += INDEXED.0;
         self.writer.write_to_known_channel(header, data)
     }
 
@@ -132,13 +164,15 @@ impl<S: Sink> ChunkWriter<S> {
 
     /// Writes an attachment, which ends the chunk.
     pub(crate) fn attach(&mut self, attachment: &Attachment<'_>) -> Result<(), McapError> {
-        self.open = 0;
+        self.close();
+        self.summary += INDEXED.2 + (attachment.name.len() + attachment.media_type.len()) as u64;
         self.writer.attach(attachment)
     }
 
     /// Writes metadata, which end the chunk.
     pub(crate) fn metadata(&mut self, name: &str, metadata: BTreeMap<String, String>) -> Result<(), McapError> {
-        self.open = 0;
+        self.close();
+        self.summary += INDEXED.2 + name.len() as u64;
         self.writer.write_metadata(&Metadata { name: name.to_owned(), metadata })
     }
 
@@ -149,7 +183,7 @@ impl<S: Sink> ChunkWriter<S> {
 
     /// Ends the chunk and hands everything to the sink.
     pub(crate) fn flush(&mut self) -> Result<(), McapError> {
-        self.open = 0;
+        self.close();
         self.writer.flush()
     }
 

@@ -22,6 +22,7 @@ mod index;
 mod integrity;
 pub mod made;
 mod names;
+pub mod notes;
 pub(crate) mod op;
 pub(crate) mod own;
 mod ownership;

@@ -9,7 +9,7 @@
 use std::fs::{File, TryLockError};
 use std::io;
 use std::os::unix::fs::MetadataExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use rapid_system::folder::{Folder, Links, Missing};
 
@@ -17,6 +17,12 @@ use rapid_system::folder::{Folder, Links, Missing};
 pub(crate) const PARTIAL: &str = "partial";
 /// Folder beside the episodes for those that were discarded.
 pub const TRASH: &str = ".trash";
+
+/// The name that this file of an episode has once it is finished, without its folder.
+pub fn finished_name(file: &Path) -> PathBuf {
+    let name = Path::new(file.file_name().unwrap_or_default());
+    if name.extension().is_some_and(|ending| ending == PARTIAL) { name.with_extension("") } else { name.to_owned() }
+}
 
 /// The owner of a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -7,12 +7,14 @@
 use std::collections::BTreeMap;
 
 use rapid_core::action::ACTION_TOPIC;
+use rapid_core::modality::ModalityKind;
+use rapid_episode::decode::Kind;
 use rapid_registry::ExportSpec;
 use rapid_registry::columns::{self, ColumnError, Vector};
 use serde_json::{Map, Value, json};
 
 use super::picture::{Codec, Pictures, Shape};
-use super::rows::{LONGEST, Refusal};
+use super::rows::{LONGEST, Refusal, Topic};
 use super::statistics::Column;
 use super::survey::{Content, Survey};
 
@@ -29,6 +31,8 @@ pub(super) const AGE: &str = "rapid.age";
 pub(super) const TIME: &str = "rapid.time_ns";
 /// Of the state and the action: the parts of the choice that they follow from.
 const CHOSEN: &str = "chosen";
+/// Columns that a message names.
+const MOST_NAMED: usize = 8;
 /// What every LeRobot dataset has, as 64-bit integers but for the first, which is f32 and seconds.
 pub(super) const OWN: [&str; 5] = ["timestamp", "frame_index", "episode_index", "index", "task_index"];
 
@@ -370,6 +374,74 @@ impl Features {
     }
 }
 
+/// Something that an episode has and the dataset does not.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
+pub struct NotExported {
+    /// The sensor, or the topic.
+    pub name: String,
+    /// Why.
+    pub reason: String,
+}
+
+impl Features {
+    /// What of an episode the dataset does not have: sensors and topics with messages, and numbers. The mask has its
+    /// features, and a frame is a row.
+    pub fn not_exported(&self, episode: &Survey) -> Vec<NotExported> {
+        let of_topic = |topic: &Topic| {
+            let place = topic.bit.and_then(|bit| episode.bits.iter().position(|other| *other == bit));
+            let (name, reason) = match (place, topic.kind) {
+                (Some(place), _) => (self.modalities.get(place)?.clone(), self.lacks(episode, place)?),
+                (None, _) if topic.name == ACTION_TOPIC => {
+                    let length = episode.action_length().unwrap_or_default();
+                    (topic.name.clone(), self.not_chosen(Origin::Topic, length, &episode.action_names)?)
+                }
+                (None, Kind::Mask | Kind::Frame) => return None,
+                (None, Kind::Event | Kind::Other | Kind::Sample(_)) => {
+                    (topic.name.clone(), "neither samples of a sensor nor actions".to_owned())
+                }
+            };
+            Some(NotExported { name, reason })
+        };
+        let mut found: Vec<NotExported> = episode.topics.iter().filter_map(of_topic).collect();
+        found.sort();
+        // A sensor has several topics if it sends what its registry did not announce.
+        found.dedup();
+        found
+    }
+
+    /// Why a modality is not in the dataset, or not all of it.
+    fn lacks(&self, episode: &Survey, place: usize) -> Option<String> {
+        match (episode.kinds.get(place)?, episode.streams.get(place)?) {
+            (ModalityKind::Depth, _) => Some("depth, for which LeRobot has no feature".to_owned()),
+            (ModalityKind::Bytes, _) => Some("bytes, for which LeRobot has no feature".to_owned()),
+            (ModalityKind::Image, _) => None,
+            (ModalityKind::Scalars, stream) => {
+                let Content::Vector { found, .. } = stream.content else { return None };
+                self.not_chosen(Origin::Modality(place), found?, &stream.names)
+            }
+        }
+    }
+
+    /// Which of so many numbers are in no column.
+    fn not_chosen(&self, origin: Origin, length: usize, names: &[String]) -> Option<String> {
+        let is_chosen =
+            |at: usize| self.state.iter().chain(&self.action).any(|axis| axis.origin == origin && axis.at == at);
+        let left: Vec<usize> = (0..length).filter(|at| !is_chosen(*at)).collect();
+        let choice = "--state, --action or [export]";
+        if left.is_empty() {
+            return None;
+        }
+        if left.len() == length {
+            return Some(format!("not chosen by {choice}"));
+        }
+        let name = |at: &usize| names.get(*at).cloned().unwrap_or_else(|| at.to_string());
+        let shown: Vec<String> = left.iter().take(MOST_NAMED).map(name).collect();
+        let more =
+            if left.len() > MOST_NAMED { format!(" and {} more", left.len() - MOST_NAMED) } else { String::new() };
+        Some(format!("columns {}{more} are not chosen by {choice}", shown.join(", ")))
+    }
+}
+
 /// The columns that `parts` name.
 fn axes(parts: &[String], vectors: &[Vector], origins: &[Origin]) -> Result<Vec<Axis>, Refusal> {
     let axis = |(place, at): (usize, usize)| {
@@ -444,6 +516,7 @@ impl Known {
 #[cfg(test)]
 mod tests {
     use rapid_status::Grade;
+    use rapid_status::session::Notes;
 
     use super::super::survey::Stream;
     use super::*;
@@ -510,6 +583,7 @@ mod tests {
             bytes: 0,
             sha256: String::new(),
             grade: Grade::Good,
+            noted: Notes::default(),
             rows: 1,
             unusable: 0,
             unfit: Vec::new(),
@@ -522,6 +596,8 @@ mod tests {
             action: None,
             time_ns: Column::default(),
             kinds: Vec::new(),
+            bits: Vec::new(),
+            topics: Vec::new(),
         }
     }
 

@@ -22,6 +22,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::{Errno, ioctl_fionbio, read};
 use rustix::process::{Pid, PidfdFlags, Signal, kill_process_group, pidfd_open};
 
+use super::owned::COMMENT;
 use super::picture::{Codec, Shape};
 
 /// How long ffmpeg may take nothing, give nothing and not end: an encoder takes seconds for a large picture.
@@ -129,7 +130,9 @@ impl Ffmpeg {
     pub(super) fn encode(&self, shape: Shape, fps: u32, file: File) -> Result<Running, FfmpegError> {
         let (size, fps) = (format!("{}x{}", shape.width, shape.height), fps.to_string());
         let raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-video_size", &size, "-framerate", &fps, "-i", "pipe:0"];
-        let end = ["-pix_fmt", "yuv420p", "-f", "mp4", "-y", "file:/dev/stdout"];
+        // By it a video without facts is known again as one of this program.
+        let comment = format!("comment={COMMENT}");
+        let end = ["-metadata", &comment, "-pix_fmt", "yuv420p", "-f", "mp4", "-y", "file:/dev/stdout"];
         self.start(&[&raw, self.codec.options(), &end].concat(), Stdio::piped(), file.into())
     }
 

@@ -1,10 +1,10 @@
 //! The files of a dataset: their names, and how they get them.
 //!
 //! Invariant: a file has its name once it is complete and on the disk; what a program leaves that is killed is called
-//! `.*.tmp`, and the next one removes it.
+//! `.*.tmp`, and the next one removes it (see `owned`).
 
 use std::ffi::OsStr;
-use std::fs::{DirEntry, File};
+use std::fs::File;
 use std::path::Path;
 
 use arrow_array::RecordBatch;
@@ -15,15 +15,17 @@ use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use rapid_system::folder::{Folder, Links, Missing, Sync};
 
 use super::error::SetError;
-use super::features::IMAGES;
+use super::owned;
 
 /// Files of a folder; also `chunks_size` in `info.json`.
 pub(super) const CHUNK: u64 = 1000;
 pub(super) const VIDEOS: &str = "videos";
 /// What is in a file of Parquet about its writer.
 pub(super) const CREATED_BY: &str = concat!("rapid ", env!("CARGO_PKG_VERSION"));
+/// What that begins with in every version.
+pub(super) const CREATOR: &str = "rapid ";
 /// What the name of a file ends with that is not complete.
-const TEMPORARY: &str = ".tmp";
+pub(super) const TEMPORARY: &str = ".tmp";
 
 /// The file of an episode in this folder of the dataset.
 pub(super) fn numbered(folder: &str, episode: u64, extension: &str) -> String {
@@ -64,29 +66,6 @@ pub(super) fn write_parquet(path: &Path, batch: Result<RecordBatch, ArrowError>)
     write(path, &written.map_err(|source| SetError::Parquet { path: path.to_owned(), source })?)
 }
 
-/// Removes what programs that were killed left in this dataset, whichever episodes they worked on.
-pub(super) fn remove_leftovers(set: &Path) -> Result<(), SetError> {
-    // A user's own folders are not touched.
-    for (folder, prefix) in [("data", "chunk-"), (VIDEOS, IMAGES)] {
-        let Ok(entries) = std::fs::read_dir(set.join(folder)) else { continue };
-        let is_ours = |entry: &DirEntry| entry.file_name().as_encoded_bytes().starts_with(prefix.as_bytes());
-        entries.flatten().filter(is_ours).try_for_each(|entry| remove_temporary(&entry.path()))?;
-    }
-    Ok(())
-}
-
-fn remove_temporary(folder: &Path) -> Result<(), SetError> {
-    let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
-    for entry in entries.flatten() {
-        let name = entry.file_name();
-        let bytes = name.as_encoded_bytes();
-        if bytes.starts_with(b".") && bytes.ends_with(TEMPORARY.as_bytes()) {
-            std::fs::remove_file(entry.path()).map_err(|source| SetError::Io { path: entry.path(), source })?;
-        }
-    }
-    Ok(())
-}
-
 /// A file that gets its name when it is complete, and disappears if it is not.
 #[derive(Debug)]
 pub(super) struct NewFile {
@@ -114,11 +93,13 @@ impl NewFile {
         self.file.try_clone().map_err(|source| SetError::Io { path: path(), source })
     }
 
-    /// Calls it `path`.
+    /// Calls it `path`, where no file of another program may be.
     pub(super) fn keep(mut self, path: &Path) -> Result<(), SetError> {
         let (folder, name) = place(path)?;
-        // Without facts: of a program that was killed between the two.
-        let _ = folder.remove(name);
+        // Without facts: of an attempt that failed between the two.
+        if owned::is_ours(path) {
+            let _ = folder.remove(name);
+        }
         let kept = self
             .file
             .sync_all()

@@ -8,7 +8,7 @@
 //! otherwise decides about its own row, and not about the episode.
 
 use std::cmp::Reverse;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::io;
 use std::ops::Range;
@@ -22,9 +22,10 @@ use rapid_core::sample::Encoding;
 use rapid_core::text;
 use rapid_core::topic::FRAME_TOPIC;
 use rapid_episode::decode::{Content, FrameSlot, Kind, Sample, Scratch};
-use rapid_episode::reader::{Item, Reader};
+use rapid_episode::reader::{Channel, Item, Reader};
 use rapid_episode::{ABOUT, ReadError};
 use rapid_registry::columns::ColumnError;
+use rapid_status::Grade;
 
 use super::picture::{self, Shape};
 
@@ -56,6 +57,9 @@ pub enum Refusal {
     /// Its verdict.
     #[error("BAD ({0}); --include-bad exports it nevertheless")]
     Bad(String),
+    /// Its verdict is not one that was selected.
+    #[error("{}", .0.word())]
+    NotSelected(Grade),
     /// A value of its metadata.
     #[error("metadata record `{ABOUT}`, key `{key}`: {problem}")]
     Metadata {
@@ -275,6 +279,15 @@ pub(super) struct Row<'a> {
     pub(super) action: &'a [f64],
 }
 
+/// A topic with messages.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Topic {
+    pub(super) name: String,
+    /// The modality whose samples it has.
+    pub(super) bit: Option<ModalityId>,
+    pub(super) kind: Kind,
+}
+
 /// The frames of an episode.
 #[derive(Debug)]
 pub(super) struct Index {
@@ -291,6 +304,8 @@ pub(super) struct Index {
     /// What has another form, and actions that cannot be used.
     pub(super) unfit: Vec<Unfit>,
     actions: Actions,
+    /// Ascending by name.
+    pub(super) topics: Vec<Topic>,
     /// The text of the registry that it was recorded with; empty if it carries none.
     pub(super) registry: String,
     /// The names of the axes of an action, as its channel lists them; empty if it does not.
@@ -400,8 +415,10 @@ impl Index {
         // By modality, in the order of the file: number and capture time; and the form.
         let mut samples: BTreeMap<ModalityId, Vec<(u32, u64)>> = BTreeMap::new();
         let mut stated: BTreeMap<ModalityId, Vec<Option<Form>>> = BTreeMap::new();
+        let mut has_messages = BTreeSet::new();
         while reader.advance()? {
             let Item::Message(message) = reader.item() else { continue };
+            has_messages.insert(message.channel.id);
             match message.channel.kind {
                 Kind::Frame => {
                     check(stop)?;
@@ -425,6 +442,11 @@ impl Index {
         let (actions, mut unfit) = sent.usable();
         let of_actions = reader.channels().find(|channel| channel.topic == ACTION_TOPIC);
         let action_names = of_actions.and_then(|channel| serde_json::from_str(channel.names.as_deref()?).ok());
+        let topic = |channel: &Channel| Topic { name: channel.topic.clone(), bit: channel.bit, kind: channel.kind };
+        let mut topics: Vec<Topic> =
+            reader.channels().filter(|channel| has_messages.contains(&channel.id)).map(topic).collect();
+        topics.sort_by(|a, b| a.name.cmp(&b.name));
+        topics.dedup_by(|a, b| a.name == b.name);
         let registry = reader.about("registry").filter(|text| text.len() <= LONGEST_REGISTRY);
         let registry = registry.unwrap_or_default().to_owned();
         let modalities = modalities(reader.about("modalities"))?;
@@ -443,6 +465,7 @@ impl Index {
             forms,
             unfit,
             actions,
+            topics,
             registry,
             action_names: action_names.unwrap_or_default(),
         })

@@ -11,8 +11,8 @@
 //! Invariant: files get their names in this order when they are complete, so that a set whose writer was killed has all
 //! its earlier episodes, or all and the last one.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap};
-use std::ffi::OsStr;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -25,6 +25,7 @@ use arrow_array::{Array, ArrayRef, Float64Array, Int64Array, RecordBatch, String
 use arrow_schema::{ArrowError, DataType, Field, Schema};
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 use rapid_episode::sha256;
+use rapid_status::session::{Label, Notes};
 use rapid_system::folder::{Folder, Links, Missing};
 use rustix::fs::FlockOperation;
 use serde_json::{Map, Value, json};
@@ -33,6 +34,7 @@ use super::cells::CellMaker;
 use super::error::SetError;
 use super::features::{Features, IMAGES, OWN};
 use super::files::{self, CHUNK, NewFile, VIDEOS, numbered, write, write_parquet};
+use super::owned;
 use super::picture::Pictures;
 use super::rows::{Index, Refusal};
 use super::statistics::Column;
@@ -47,6 +49,11 @@ const SOURCE: &str = "rapid/source";
 const SHA256: &str = "rapid/sha256";
 const BYTES: &str = "rapid/bytes";
 const VERDICT: &str = "rapid/verdict";
+/// What people noted about the episode; empty where they did not.
+const LABEL: &str = "rapid/label";
+const LABEL_REASON: &str = "rapid/label_reason";
+const NOTE: &str = "rapid/note";
+const MARKS: &str = "rapid/marks";
 /// As pandas names an index without a name.
 const TASK: &str = "__index_level_0__";
 
@@ -59,6 +66,8 @@ pub(super) struct Entry {
     pub(super) rows: u64,
     pub(super) task: u64,
     statistics: Statistics,
+    /// `None` of an earlier version, which did not keep it.
+    noted: Option<Notes>,
 }
 
 /// By feature, a column of it after the other.
@@ -96,9 +105,8 @@ impl DataSet {
         }
         set.lock(Missing::Refused)?;
         let info = folder.join("meta/info.json");
-        if !info.exists() {
-            let set = set.unnamed()?;
-            files::remove_leftovers(folder)?;
+        if std::fs::symlink_metadata(&info).is_err() {
+            owned::check(folder, None)?;
             return Ok(set);
         }
         let foreign = |problem: &str| SetError::Foreign { path: info.clone(), problem: problem.to_owned() };
@@ -107,34 +115,19 @@ impl DataSet {
         let value: Value = serde_json::from_str(&text).map_err(|error| foreign(&error.to_string()))?;
         let features = Features::of_set(&value);
         set.features = Some(features.ok_or_else(|| foreign("not the features of a dataset of this version of rapid"))?);
-        files::remove_leftovers(folder)?;
         set.read_tasks()?;
         while let Some(entry) = set.read_entry()? {
             merge(&mut set.statistics, &entry.statistics);
             set.entries.push(entry);
         }
-        // Rows and videos whose facts are missing: the program was killed between the two, and LeRobot would read them.
-        let next = set.entries.len() as u64;
-        for left in set.video_paths(next).into_iter().chain([set.data_path(next)]).filter(|left| left.exists()) {
-            std::fs::remove_file(&left).map_err(|source| SetError::Io { path: left, source })?;
-        }
+        // Rows and videos whose facts are missing are removed: the program was killed between the two, and LeRobot would read
+        // them.
+        owned::check(folder, Some(set.entries.len() as u64))?;
         // The program was killed between an episode and the files about all of them.
         if value["total_episodes"].as_u64() != Some(set.entries.len() as u64) {
             set.publish()?;
         }
         Ok(set)
-    }
-
-    /// A folder without `info.json`: what a program left that was killed with its first episode, or an empty one.
-    fn unnamed(self) -> Result<Self, SetError> {
-        let folder = &self.folder;
-        let entries = std::fs::read_dir(folder).map_err(|source| SetError::Io { path: folder.clone(), source })?;
-        let is_ours = |name: &OsStr| ["data", "meta", VIDEOS].iter().any(|ours| name == *ours);
-        let other = entries.flatten().find(|entry| !is_ours(&entry.file_name()));
-        match other {
-            Some(other) => Err(SetError::Foreign { path: other.path(), problem: "not of a dataset".to_owned() }),
-            None => Ok(self),
-        }
     }
 
     fn lock(&mut self, missing: Missing) -> Result<(), SetError> {
@@ -145,6 +138,10 @@ impl DataSet {
         rustix::fs::flock(open.descriptor(), FlockOperation::NonBlockingLockExclusive)
             .map_err(|_| SetError::Busy(self.folder.clone()))?;
         self.lock = Some(open);
+        if missing == Missing::All {
+            // It did not exist when the set was opened.
+            owned::check(&self.folder, None)?;
+        }
         Ok(())
     }
 
@@ -172,7 +169,37 @@ impl DataSet {
     /// # Errors
     /// When it cannot be created, or another program writes to it.
     pub fn begin(&mut self) -> Result<(), SetError> {
-        self.lock(Missing::All)
+        self.lock(Missing::All)?;
+        // LeRobot loads facts only if all of them have the same columns.
+        let earlier = |(number, entry): (usize, &Entry)| entry.noted.is_none().then_some(number);
+        let earlier: Vec<usize> = self.entries.iter().enumerate().filter_map(earlier).collect();
+        earlier.into_iter().try_for_each(|number| self.note(number, &Notes::default()))
+    }
+
+    /// Notes what people noted about an episode that is there already.
+    ///
+    /// # Errors
+    /// When its facts cannot be written.
+    pub fn note(&mut self, number: usize, noted: &Notes) -> Result<(), SetError> {
+        let path = self.entry_path(number as u64);
+        let Some(entry) = self.entries.get_mut(number).filter(|entry| entry.noted.as_ref() != Some(noted)) else {
+            return Ok(());
+        };
+        let wrong = |source| SetError::Parquet { path: path.clone(), source };
+        let batch = one_row(&path).map_err(wrong)?;
+        let batch =
+            batch.ok_or_else(|| SetError::Foreign { path: path.clone(), problem: "not of one row".to_owned() })?;
+        let texts = texts(noted);
+        let mut row = OneRow::default();
+        for (field, column) in batch.schema().fields().iter().zip(batch.columns()) {
+            if texts.iter().all(|(key, _)| field.name() != key) {
+                row.push(field.name(), Arc::clone(column));
+            }
+        }
+        row.texts(texts);
+        write_parquet(&path, row.batch())?;
+        entry.noted = Some(noted.clone());
+        Ok(())
     }
 
     /// Where these episodes will be if all of them are appended, in this order.
@@ -263,6 +290,7 @@ impl DataSet {
             rows: episode.rows as u64,
             task: position.task,
             statistics: statistics(episode, features, position),
+            noted: Some(episode.noted.clone()),
         };
         self.write_entry(&entry, episode, features, position)?;
         self.features.get_or_insert_with(|| features.clone());
@@ -341,6 +369,7 @@ impl DataSet {
             rows: number("length")?,
             task: self.tasks.iter().position(|known| *known == task)? as u64,
             statistics,
+            noted: noted(&text),
         })
     }
 
@@ -375,9 +404,8 @@ impl DataSet {
                 row.push(&format!("{VIDEOS}/{key}/{name}"), Arc::new(Float64Array::from(vec![time])));
             }
         }
-        for (key, text) in [(SOURCE, &*entry.source), (SHA256, &*entry.sha256), (VERDICT, episode.grade.word())] {
-            row.push(key, Arc::new(StringArray::from(vec![text])));
-        }
+        row.texts([(SOURCE, &*entry.source), (SHA256, &*entry.sha256), (VERDICT, episode.grade.word())]);
+        row.texts(texts(&episode.noted));
         for feature in features.all() {
             let key = feature.key;
             let columns = entry.statistics.get(&key).map_or(&[][..], Vec::as_slice);
@@ -464,6 +492,24 @@ impl DataSet {
         }
         Ok(())
     }
+}
+
+/// What people noted, as texts; the marks as JSON.
+fn texts(notes: &Notes) -> [(&'static str, Cow<'_, str>); 4] {
+    let label = notes.label.map(Label::word).unwrap_or_default();
+    let marks = if notes.marks.is_empty() { String::new() } else { json!(notes.marks).to_string() };
+    let own = [(LABEL, label), (LABEL_REASON, &*notes.label_reason), (NOTE, &*notes.note)];
+    let [label, reason, note] = own.map(|(key, text)| (key, Cow::Borrowed(text)));
+    [label, reason, note, (MARKS, Cow::Owned(marks))]
+}
+
+/// What is in an episode's facts; `None` if a text of it is missing.
+fn noted(text: &dyn Fn(&str) -> Option<String>) -> Option<Notes> {
+    let word = text(LABEL)?;
+    let label = [Label::Success, Label::Failure].into_iter().find(|label| label.word() == word);
+    let marks = text(MARKS)?;
+    let marks = if marks.is_empty() { Vec::new() } else { serde_json::from_str(&marks).ok()? };
+    Some(Notes { label, label_reason: text(LABEL_REASON)?, note: text(NOTE)?, marks })
 }
 
 fn data_path(folder: &Path, episode: u64) -> PathBuf {
@@ -583,6 +629,12 @@ impl OneRow {
 
     fn number(&mut self, key: &str, value: u64) {
         self.push(key, Arc::new(Int64Array::from(vec![i64::try_from(value).unwrap_or(i64::MAX)])));
+    }
+
+    fn texts(&mut self, texts: impl IntoIterator<Item = (&'static str, impl AsRef<str>)>) {
+        for (key, text) in texts {
+            self.push(key, Arc::new(StringArray::from(vec![text.as_ref()])));
+        }
     }
 
     fn batch(self) -> Result<RecordBatch, ArrowError> {

@@ -4,22 +4,34 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use rapid_core::modality::ModalityKind;
+use rapid_core::modality::{ModalityId, ModalityKind};
 use rapid_core::text;
 use rapid_episode::record::inspect::{self, Inspection, Judgement};
 use rapid_episode::record_iter::FileEnd;
 use rapid_pictures::pixels::{CHANNELS, Picture, Pixels};
 use rapid_registry::{ExportSpec, Form, Registry};
+use rapid_status::session::Notes;
 use rapid_status::{Grade, Verdict};
 
 use super::picture::{self, Shape};
-use super::rows::{Form as SampleForm, Index, Listed, Payload, Refusal, Row, Unfit};
+use super::rows::{Form as SampleForm, Index, Listed, Payload, Refusal, Row, Topic, Unfit};
 use super::statistics::Column;
 
 /// Of a picture with more pixels along a side, every n-th of each row and column counts for the statistics, so that
 /// about 150 are left, as in `lerobot.datasets.compute_stats.auto_downsample_height_width`.
 const WIDE: u32 = 300;
 const ABOUT_LEFT: u32 = 150;
+
+/// Which verdicts an episode may have.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdicts<'a> {
+    /// GOOD and SUSPECT.
+    Fit,
+    /// Every one.
+    All,
+    /// These.
+    Only(&'a [Grade]),
+}
 
 /// An episode that can be exported.
 #[derive(Debug)]
@@ -32,6 +44,8 @@ pub struct Survey {
     pub sha256: String,
     /// The verdict on it.
     pub grade: Grade,
+    /// What people noted about it; nothing until it is set.
+    pub noted: Notes,
     /// Rows it becomes.
     pub rows: usize,
     /// Samples that belong to a row and cannot be used: damaged pictures, numbers that are not finite. Their rows are
@@ -54,6 +68,10 @@ pub struct Survey {
     pub(super) time_ns: Column,
     /// By modality.
     pub(super) kinds: Vec<ModalityKind>,
+    /// By modality.
+    pub(super) bits: Vec<ModalityId>,
+    /// Those with messages.
+    pub(super) topics: Vec<Topic>,
 }
 
 /// What a modality has in all rows of an episode.
@@ -82,13 +100,13 @@ pub(super) enum Content {
     Bytes,
 }
 
-/// Looks at the episode at `path`; `sha256` is that of the file. One that is BAD is refused unless `include_bad`.
+/// Looks at the episode at `path`; `sha256` is that of the file. One with another verdict than `verdicts` is refused.
 ///
 /// # Errors
 /// When it cannot be exported, whatever the dataset; also when `stop` is set.
-pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool) -> Result<Survey, Refusal> {
+pub fn survey(path: &Path, sha256: String, verdicts: Verdicts<'_>, stop: &AtomicBool) -> Result<Survey, Refusal> {
     let inspection = inspect::inspect(path)?;
-    let grade = judged(&inspection, include_bad)?;
+    let grade = judged(&inspection, verdicts)?;
     let index = Index::read(path, stop)?;
     if index.modalities.iter().all(|modality| matches!(modality.kind, ModalityKind::Bytes | ModalityKind::Depth)) {
         return Err(Refusal::Nothing);
@@ -112,6 +130,7 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
         bytes: inspection.bytes,
         sha256,
         grade,
+        noted: Notes::default(),
         rows,
         unusable,
         unfit,
@@ -124,6 +143,8 @@ pub fn survey(path: &Path, sha256: String, include_bad: bool, stop: &AtomicBool)
         action: index.action_length().map(|_| columns(actions)),
         time_ns: Column::from_values(&mut times),
         kinds: index.modalities.iter().map(|modality| modality.kind).collect(),
+        bits: index.modalities.iter().map(|modality| modality.bit).collect(),
+        topics: index.topics,
     })
 }
 
@@ -140,7 +161,7 @@ fn registry_of(text: &str) -> (Option<Registry>, Option<String>) {
 }
 
 /// The verdict, of a whole file.
-fn judged(inspection: &Inspection, include_bad: bool) -> Result<Grade, Refusal> {
+fn judged(inspection: &Inspection, verdicts: Verdicts<'_>) -> Result<Grade, Refusal> {
     let Judgement::Episode(Verdict { grade, .. }) = &inspection.verdict else { return Err(Refusal::NotOurs) };
     match inspection.end {
         FileEnd::Finished => {}
@@ -153,10 +174,11 @@ fn judged(inspection: &Inspection, include_bad: bool) -> Result<Grade, Refusal> 
         let chunks = text::counted(chunks, "damaged chunk");
         return Err(Refusal::Damaged(format!("{chunks}, {} that cannot be read", text::size(bytes))));
     }
-    if *grade == Grade::Bad && !include_bad {
-        return Err(Refusal::Bad(inspection.verdict.reasons().join("; ")));
+    match verdicts {
+        Verdicts::Fit if *grade == Grade::Bad => Err(Refusal::Bad(inspection.verdict.reasons().join("; "))),
+        Verdicts::Only(grades) if !grades.contains(grade) => Err(Refusal::NotSelected(*grade)),
+        Verdicts::Fit | Verdicts::All | Verdicts::Only(_) => Ok(*grade),
     }
-    Ok(*grade)
 }
 
 /// Collects what is in the rows.

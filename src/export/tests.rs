@@ -20,6 +20,7 @@ use rapid_episode::{sha256, text_map};
 use rapid_pictures::pixels::{Picture, Pixels};
 use rapid_registry::ExportSpec;
 use rapid_status::Grade;
+use rapid_status::session::Notes;
 
 use super::cells::CellMaker;
 use super::error::SetError;
@@ -28,7 +29,7 @@ use super::picture::{Codec, Pictures, Shape};
 use super::rows::{Form, Index, Listed, Refusal, Row};
 use super::set::{DataSet, prepare};
 use super::statistics::Column;
-use super::survey::{Content, Stream, Survey, survey};
+use super::survey::{Content, Stream, Survey, Verdicts, survey};
 use super::table::{Position, Rows, Table};
 use super::verify::verify;
 use super::video::{Encoded, FrameMaker, Shown};
@@ -189,6 +190,7 @@ fn surveyed(path: &Path, task: &str) -> Survey {
         bytes: 0,
         sha256: sha256(path).unwrap(),
         grade: Grade::Good,
+        noted: Notes::default(),
         rows: index.ticks.len(),
         unusable: 0,
         unfit: Vec::new(),
@@ -201,6 +203,8 @@ fn surveyed(path: &Path, task: &str) -> Survey {
         action: None,
         time_ns: none,
         kinds: index.modalities.iter().map(|modality| modality.kind).collect(),
+        bits: Vec::new(),
+        topics: Vec::new(),
     }
 }
 
@@ -260,31 +264,175 @@ fn rows_that_were_prepared_for_another_position_are_written_again() {
     assert_eq!(set.episodes(), 0);
 }
 
+/// Writes a file of a folder, with the folders on the way.
+fn put(folder: &Path, file: &str, contents: &[u8]) -> PathBuf {
+    let path = folder.join(file);
+    std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+    std::fs::write(&path, contents).unwrap();
+    path
+}
+
 #[test]
 fn what_a_killed_export_left_is_removed_when_the_set_is_opened() {
     let folder = tempfile::tempdir().unwrap();
-    let write = |file: &str| {
-        let path = folder.path().join(file);
-        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
-        std::fs::write(&path, "rows").unwrap();
-        path
-    };
     let left = [
         "data/chunk-000/.file-003.parquet.tmp",
         "data/chunk-012/.file-000.parquet.tmp",
         "videos/observation.images.cam/.file-003.mp4.tmp",
-    ]
-    .map(write);
-    let kept = ["data/mine/.notes.tmp", "data/chunk-000/notes.tmp", "videos/mine/.notes.tmp"].map(write);
+        "videos/observation.images.cam/.0a9f.mp4.tmp",
+        "meta/.stats.json.4711.tmp",
+        "meta/episodes/chunk-000/.file-000.parquet.4711.123456789.tmp",
+    ];
+    let new = folder.path().join("new");
+    let in_new = left.map(|file| put(&new, file, b"rows"));
     // Nothing is appended.
-    drop(DataSet::open(folder.path()).unwrap());
-    assert_eq!(left.map(|path| path.exists()), [false; 3]);
-    assert_eq!(kept.map(|path| path.exists()), [true; 3]);
+    drop(DataSet::open(&new).unwrap());
+    assert_eq!(in_new.map(|path| path.exists()), [false; 6]);
     // A folder of something else is left as it is.
-    let other = write("data/chunk-000/.file-003.parquet.tmp");
-    write("notes.txt");
-    DataSet::open(folder.path()).unwrap_err();
+    let other = put(&new, left[0], b"rows");
+    put(&new, "notes.txt", b"mine");
+    DataSet::open(&new).unwrap_err();
     assert!(other.exists());
+    // Beside a dataset other files are left alone.
+    let set = folder.path().join("set");
+    exported(&set, &[recorded(folder.path(), "a", [true, true], [0.0; 3])]);
+    let in_set = left.map(|file| put(&set, file, b"rows"));
+    let kept = [
+        "README.md",
+        "data/mine/.notes.tmp",
+        "data/chunk-000/notes.tmp",
+        "data/chunk-000/.notes.tmp",
+        "videos/mine/.notes.tmp",
+        "meta/notes.json",
+    ];
+    let kept = kept.map(|file| put(&set, file, b"mine"));
+    assert_eq!(DataSet::open(&set).unwrap().episodes(), 1);
+    assert_eq!((in_set.map(|path| path.exists()), kept.map(|path| path.exists())), ([false; 6], [true; 6]));
+}
+
+/// All that is in a folder, with what it holds or leads to.
+fn everything(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for entry in std::fs::read_dir(folder).unwrap().flatten() {
+        let (path, kind) = (entry.path(), entry.file_type().unwrap());
+        if kind.is_symlink() {
+            found.insert(path.clone(), std::fs::read_link(&path).unwrap().into_os_string().into_encoded_bytes());
+        } else if kind.is_dir() {
+            found.extend(everything(&path));
+            found.insert(path, Vec::new());
+        } else {
+            found.insert(path.clone(), std::fs::read(&path).unwrap());
+        }
+    }
+    found
+}
+
+/// Something of another program in a place of the dataset.
+#[derive(Debug, Clone, Copy)]
+enum Strange {
+    File(&'static str),
+    Folder(&'static str),
+    /// To a folder of somebody else, or to a file in it.
+    Link(&'static str),
+}
+
+impl Strange {
+    fn put(self, set: &Path, elsewhere: &Path) {
+        match self {
+            Self::File(file) => drop(put(set, file, b"of somebody else")),
+            Self::Folder(file) => std::fs::create_dir_all(set.join(file)).unwrap(),
+            Self::Link(file) => {
+                std::fs::create_dir_all(set.join(file).parent().unwrap()).unwrap();
+                let is_file = file.contains(".parquet") || file.contains(".json");
+                let target = if is_file { elsewhere.join("theirs") } else { elsewhere.to_owned() };
+                std::os::unix::fs::symlink(target, set.join(file)).unwrap();
+            }
+        }
+    }
+}
+
+#[test]
+fn an_export_does_not_touch_what_it_did_not_write() {
+    use Strange::{File, Folder, Link};
+    let folder = tempfile::tempdir().unwrap();
+    let elsewhere = folder.path().join("elsewhere");
+    put(&elsewhere, "theirs", b"of somebody else");
+    let episodes = ["a", "b"].map(|name| recorded(folder.path(), name, [true, true], [0.0; 3]));
+    let [first, second] = &episodes;
+    // In the place of a new dataset.
+    let of_new = [
+        File("data/chunk-000/file-000.parquet"),
+        File("data/chunk-000/file-007.parquet"),
+        File("data/train.csv"),
+        File("data"),
+        File("meta/info.json.old"),
+        File("meta/tasks.parquet"),
+        File("meta/stats.json"),
+        File("meta/episodes/chunk-000/file-000.parquet"),
+        File("videos/observation.images.cam/chunk-000/file-000.mp4"),
+        Folder("data/chunk-000/file-000.parquet"),
+        Folder("mine"),
+        Link("data"),
+        Link("data/chunk-000"),
+        Link("data/chunk-000/file-000.parquet"),
+        Link("meta"),
+        Link("meta/episodes"),
+        Link("meta/tasks.parquet"),
+        Link("videos"),
+    ];
+    // In the place of the second episode of a dataset of one, or of what is written again with it.
+    let of_second = [
+        File("data/chunk-000/file-001.parquet"),
+        File("data/chunk-000/file-001.parquet/mine"),
+        File("data/chunk-001/file-000.parquet"),
+        File("videos/observation.images.cam/chunk-000/file-001.mp4"),
+        File("meta/episodes/chunk-000/file-002.parquet"),
+        Folder("meta/episodes/chunk-000/file-002.parquet"),
+        Link("data/chunk-000/file-001.parquet"),
+        Link("data/chunk-001"),
+        Link("videos/observation.images.cam"),
+    ];
+    let of_new = of_new.into_iter().map(|strange| (strange, None));
+    let all = of_new.chain(of_second.into_iter().map(|strange| (strange, Some(first))));
+    for (number, (strange, before)) in all.enumerate() {
+        let out = folder.path().join(format!("set {number}"));
+        if let Some(first) = before {
+            exported(&out, std::slice::from_ref(first));
+        }
+        strange.put(&out, &elsewhere);
+        let found = everything(folder.path());
+        let refused = DataSet::open(&out).map(|set| set.episodes()).map_err(|error| error.to_string());
+        assert!(
+            refused.as_ref().is_err_and(|text| text.contains("--out takes a new folder")),
+            "{strange:?}: {refused:?}"
+        );
+        assert!(everything(folder.path()) == found, "{strange:?}");
+    }
+    // Put there while the set is open, and there before the rows get their name.
+    let out = folder.path().join("meanwhile");
+    exported(&out, std::slice::from_ref(first));
+    let stop = AtomicBool::new(false);
+    let mut set = DataSet::open(&out).unwrap();
+    let survey = survey(second, sha256(second).unwrap(), Verdicts::All, &stop).unwrap();
+    let features = set.features().unwrap().clone();
+    let position = set.positions([&survey])[0];
+    let prepared = prepare(&out, &survey, &features, position, Encoded::default(), &stop).unwrap();
+    let theirs = put(&out, "data/chunk-000/file-001.parquet", b"of somebody else");
+    set.append(&survey, &features, prepared, &stop).unwrap_err();
+    assert_eq!(std::fs::read(&theirs).unwrap(), b"of somebody else");
+}
+
+#[test]
+fn a_dataset_without_its_info_is_not_begun_anew() {
+    let folder = tempfile::tempdir().unwrap();
+    let episodes = ["a", "b"].map(|name| recorded(folder.path(), name, [true, true], [0.0; 3]));
+    let out = folder.path().join("set");
+    exported(&out, &episodes);
+    std::fs::remove_file(out.join("meta/info.json")).unwrap();
+    let found = everything(&out);
+    let refused = DataSet::open(&out).unwrap_err().to_string();
+    assert!(refused.contains("file-001.parquet: of a dataset without its meta/info.json"), "{refused}");
+    assert!(everything(&out) == found);
 }
 
 #[test]
@@ -375,7 +523,7 @@ fn recorded(folder: &Path, name: &str, present: [bool; 2], values: [f64; 3]) -> 
 fn exported(out: &Path, episodes: &[PathBuf]) -> Vec<Survey> {
     let stop = AtomicBool::new(false);
     let surveys: Vec<Survey> =
-        episodes.iter().map(|path| survey(path, sha256(path).unwrap(), true, &stop).unwrap()).collect();
+        episodes.iter().map(|path| survey(path, sha256(path).unwrap(), Verdicts::All, &stop).unwrap()).collect();
     let mut set = DataSet::open(out).unwrap();
     set.begin().unwrap();
     for (number, episode) in surveys.iter().enumerate() {

@@ -1,20 +1,21 @@
 //! Services by which a client begins and ends episodes, and arms and disarms, and parameters: task and tags.
 //!
-//! Invariant: there are none unless the user allowed them: the protocol has no password, and web pages of a browser on
-//! this machine reach a loopback address too.
+//! Invariant: there are none unless the user allowed them: the protocol has no password, and every program of
+//! this machine reaches a loopback address too.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use foxglove::Schema;
-use foxglove::websocket::service::{Service, ServiceSchema};
-use foxglove::websocket::{
-    AnyClient, GetParametersResponder, Parameter, ParameterHandler, ParameterValue, SetParametersResponder,
-};
+use foxglove::ws_protocol::client::{ClientMessage, ServiceCallRequest};
+use foxglove::ws_protocol::parameter::{Parameter, ParameterValue};
+use foxglove::ws_protocol::schema::{EncodeError, Schema};
+use foxglove::ws_protocol::server::advertise_services::Service;
+use foxglove::ws_protocol::server::{AdvertiseServices, ParameterValues, ServiceCallFailure, ServiceCallResponse};
 use rapid_core::permission::Permission;
 use rapid_core::time::Stamp;
 use rapid_status::session::{Asker, SessionRequest};
 use tokio::sync::oneshot;
+use tokio_tungstenite::tungstenite::Message;
 
 /// What clients may request.
 #[derive(Clone)]
@@ -49,29 +50,65 @@ impl Control {
     ];
 }
 
+/// The encoding of requests and answers.
+pub(super) const JSON: &str = "json";
 /// JSON Schema of a request, which has no fields, and of an answer.
 const REQUEST: &str = r#"{"type":"object","properties":{}}"#;
 const ANSWER: &str = r#"{"type":"object","properties":{"text":{"type":"string"}}}"#;
 
 impl Controls {
-    pub(super) fn services(&self) -> Vec<Service> {
-        let service = |(control, name): (Control, &'static str)| {
-            let schema = |name, text: &'static str| Schema::new(name, "jsonschema", text.as_bytes());
-            let described = ServiceSchema::new("rapid.Control")
-                .with_request("json", schema("rapid.ControlRequest", REQUEST))
-                .with_response("json", schema("rapid.ControlAnswer", ANSWER));
-            let controls = self.clone();
-            Service::builder(name, described).async_handler_fn(move |_| {
-                let controls = controls.clone();
-                async move {
-                    let answer = controls.carry_out(control).await;
-                    let (Ok(text) | Err(text)) = &answer;
-                    tracing::info!("Foxglove: a client called {name}: {text}");
-                    answer.map(|text| serde_json::json!({ "text": text }).to_string())
-                }
-            })
+    /// The message that offers the services.
+    ///
+    /// # Errors
+    /// None: their schemas are texts.
+    pub(super) fn services() -> Result<Message, EncodeError> {
+        let schema = |name: &'static str, text: &'static str| Schema::new(name, "jsonschema", text.as_bytes());
+        let service = |(id, (_, name)): (u32, (Control, &'static str))| {
+            Service::new(id, name, "rapid.Control")
+                .with_request(JSON, schema("rapid.ControlRequest", REQUEST))?
+                .with_response(JSON, schema("rapid.ControlAnswer", ANSWER))
         };
-        Control::ALL.into_iter().map(service).collect()
+        let services = (0..).zip(Control::ALL).map(service).collect::<Result<Vec<_>, _>>()?;
+        Ok(Message::from(&AdvertiseServices::new(services)))
+    }
+
+    /// Carries out a request, and returns its answer.
+    pub(super) async fn answer(&self, request: ClientMessage<'static>) -> Option<Message> {
+        match request {
+            ClientMessage::ServiceCallRequest(call) => Some(self.call(call).await),
+            ClientMessage::GetParameters(get) => Some(self.values(&get.parameter_names, get.id).await),
+            ClientMessage::SetParameters(set) => {
+                let names: Vec<_> = set.parameters.iter().map(|parameter| parameter.name.clone()).collect();
+                self.change(set.parameters).await;
+                // As they are now, whether they were changed or not.
+                Some(self.values(&names, set.id).await)
+            }
+            _ => None,
+        }
+    }
+
+    async fn call(&self, call: ServiceCallRequest<'static>) -> Message {
+        let ServiceCallRequest { service_id, call_id, .. } = call;
+        let service = usize::try_from(service_id).ok().and_then(|id| Control::ALL.get(id));
+        let Some((control, name)) = service else {
+            return Message::from(&ServiceCallFailure::new(service_id, call_id, "there is no such service"));
+        };
+        let answer = self.carry_out(*control).await;
+        let (Ok(text) | Err(text)) = &answer;
+        tracing::info!("Foxglove: a client called {name}: {text}");
+        match answer {
+            Ok(text) => {
+                let payload = serde_json::json!({ "text": text }).to_string().into_bytes().into();
+                Message::from(&ServiceCallResponse { service_id, call_id, encoding: JSON.into(), payload })
+            }
+            Err(text) => Message::from(&ServiceCallFailure::new(service_id, call_id, text)),
+        }
+    }
+
+    async fn values(&self, names: &[String], id: Option<String>) -> Message {
+        let mut values = ParameterValues::new(self.parameters(names).await);
+        values.id = id;
+        Message::from(&values)
     }
 
     async fn carry_out(&self, control: Control) -> Result<String, String> {
@@ -141,21 +178,4 @@ fn plan(parameters: Vec<Parameter>) -> Option<SessionRequest> {
 fn texts(dict: BTreeMap<String, ParameterValue>) -> impl Iterator<Item = (String, String)> {
     let text = |(key, value)| if let ParameterValue::String(text) = value { Some((key, text)) } else { None };
     dict.into_iter().filter_map(text)
-}
-
-impl ParameterHandler for Controls {
-    fn get(&self, _: AnyClient, names: Vec<String>, _: Option<String>, responder: GetParametersResponder) {
-        let controls = self.clone();
-        tokio::spawn(async move { responder.respond(controls.parameters(&names).await) });
-    }
-
-    fn set(&self, _: AnyClient, parameters: Vec<Parameter>, _: Option<String>, responder: SetParametersResponder) {
-        let controls = self.clone();
-        tokio::spawn(async move {
-            let names: Vec<_> = parameters.iter().map(|parameter| parameter.name.clone()).collect();
-            controls.change(parameters).await;
-            // As they are now, whether they were changed or not.
-            responder.respond(controls.parameters(&names).await);
-        });
-    }
 }

@@ -7,31 +7,39 @@
 //! The protocol is `foxglove.sdk.v1` (<https://github.com/foxglove/ws-protocol>), by the crate `foxglove`.
 //!
 //! Invariant: nothing else waits for this thread: a client that reads slowly, or not at all, gets the newest of each topic
-//! when it reads (`relay`).
+//! when it reads (`queue`).
+//! Invariant: whoever connects holds little: what a client may send and what waits for it is bounded (`connections`), and
+//! pages of other sites are refused.
 //! Invariant: a turn is short, whatever waits on the bus: on a busy machine the connections would wait for its end, and of all that it
 //! sends a client gets the last topics alone.
 //! Invariant: whatever ends the thread, the run continues.
 
+mod client;
+mod connections;
 mod control;
 mod pictures;
-mod relay;
+mod queue;
 mod topics;
 
 use std::io;
-use std::net::{Ipv4Addr, SocketAddr};
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Weak, mpsc};
+use std::net::SocketAddr;
+use std::sync::{Arc, mpsc};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use foxglove::websocket::{ChannelView, Client, ServerListener, Status};
-use foxglove::{Context, FoxgloveError, WebSocketServerHandle};
+use foxglove::Context;
+use foxglove::ws_protocol::schema::EncodeError;
+use foxglove::ws_protocol::server::ServerInfo;
+use foxglove::ws_protocol::server::server_info::Capability;
 use tokio::sync::broadcast::{self, error::TryRecvError};
 use tokio::sync::{oneshot, watch};
 use tokio::task::{JoinHandle as TaskHandle, yield_now};
 use tokio::time::{sleep, timeout};
+use tokio_tungstenite::tungstenite::Message;
 use tokio_util::sync::CancellationToken;
 
+use client::Audience;
+use connections::{Host, Origins};
 pub use control::Controls;
 use rapid_bus::{BusError, Queues, Subscription};
 use rapid_core::time::{Stamp, WallClock};
@@ -44,14 +52,11 @@ use topics::Topics;
 /// Port of a Foxglove server, if none is named.
 const PORT: u16 = 8765;
 
-/// Clients that may subscribe at a time: they hold memory.
-const CLIENTS: usize = 8;
 /// Time between two looks at the bus, with clients and without.
 const TURN: Duration = Duration::from_millis(5);
 const IDLE_TURN: Duration = Duration::from_millis(50);
-/// Samples of a topic that a turn sends at most. Of the topics of most rigs, and what is derived from them, these are fewer than
-/// the server's queue for a client holds, 1,024; of a rig with so many more, a client that cannot keep up misses the oldest.
-const IN_A_TURN: usize = 12;
+/// Samples of a topic that a turn sends at most: they wait until the connections have their turn.
+const IN_A_TURN: usize = 32;
 /// A client gets the end of the connection within this time, or it is closed.
 const LAST: Duration = Duration::from_millis(500);
 /// Shortest time between two lines of the log about what was left out.
@@ -60,12 +65,14 @@ const REPORT_EVERY: Duration = Duration::from_secs(5);
 const NICE: i32 = 10;
 
 /// Where the server listens, and what clients may request.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FoxgloveOptions {
     /// Its address; with port 0 a free one is chosen.
     pub address: SocketAddr,
     /// Clients may begin and end episodes, and arm and disarm.
     pub control: bool,
+    /// Pages of browsers that may connect, beside the app's own: `http://localhost:8080`, as browsers send it in `Origin`.
+    pub origins: Vec<String>,
 }
 
 /// Why there is no server.
@@ -81,7 +88,7 @@ pub enum ServerError {
     },
     /// The server did not start for another reason.
     #[error("--foxglove: {0}")]
-    Server(#[from] FoxgloveError),
+    Server(#[from] EncodeError),
     /// The system provides no thread, or no runtime.
     #[error("--foxglove: {0}")]
     System(#[from] io::Error),
@@ -151,6 +158,7 @@ impl FoxgloveServer {
         let (feed, first_feed) = oneshot::channel();
         let (listening, listens) = oneshot::channel();
         let (stopped, guard) = (stop.clone(), ended.clone().drop_guard());
+        let wanted = options.clone();
         let thread = std::thread::Builder::new().name("foxglove".to_owned()).spawn(move || {
             // Dropped by a panic too.
             let _guard = guard;
@@ -161,7 +169,7 @@ impl FoxgloveServer {
                 Err(error) => return drop(listening.send(Err(error.into()))),
             };
             runtime.block_on(async {
-                match Server::start(options, &registry, controls).await {
+                match Server::start(wanted, &registry, controls).await {
                     Ok((server, address)) => {
                         // Without a receiver the run has ended.
                         let _ = listening.send(Ok(address));
@@ -179,7 +187,7 @@ impl FoxgloveServer {
     }
 
     fn announce(&self) {
-        let FoxgloveOptions { address, control } = self.options;
+        let FoxgloveOptions { address, control, .. } = self.options;
         let text = format!("Foxglove: open connection ws://{address}");
         self.board.announce(EventKind::Log { level: Level::Info, text });
         if !address.ip().is_loopback() {
@@ -232,9 +240,9 @@ impl Drop for FoxgloveServer {
 
 /// The work of the thread.
 struct Server {
-    handle: WebSocketServerHandle,
-    /// Connects clients, until `closing`.
-    relay: TaskHandle<()>,
+    audience: Arc<Audience>,
+    /// Serves clients, until `closing`.
+    connections: TaskHandle<()>,
     closing: CancellationToken,
     topics: Topics,
     reported: Stamp,
@@ -246,28 +254,24 @@ impl Server {
         registry: &Registry,
         controls: Option<Controls>,
     ) -> Result<(Self, SocketAddr), ServerError> {
-        let FoxgloveOptions { address, .. } = options;
+        let FoxgloveOptions { address, origins, .. } = options;
         let in_use = |source| ServerError::Listen { address, source };
-        let listener = relay::listen(address).await.map_err(in_use)?;
+        let listener = connections::listen(address).await.map_err(in_use)?;
         let bound = listener.local_addr().map_err(in_use)?;
         let context = Context::new();
         let topics = Topics::advertise(&context, registry);
-        let audience = Audience { context: Arc::downgrade(&context), clients: AtomicUsize::new(0) };
-        let mut server = context
-            .websocket_server()
-            .name(format!("rapid {}", registry.rig.name))
-            // Clients reach it through the relay, which reads at once: its queues hold what one turn sends.
-            .bind(Ipv4Addr::LOCALHOST.to_string(), 0)
-            .listener(Arc::new(audience));
-        if let Some(controls) = controls {
-            server = server.services(controls.services()).supported_encodings(["json"]);
-            server = server.parameter_handler(Arc::new(controls));
-        }
-        let handle = server.start().await?;
-        let closing = CancellationToken::new();
-        let server = SocketAddr::from((Ipv4Addr::LOCALHOST, handle.port()));
-        let relay = tokio::spawn(relay::serve(listener, server, relay::LIMIT, closing.clone()));
-        Ok((Self { handle, relay, closing, topics, reported: Stamp::now() }, bound))
+        let machine = rustix::system::uname().nodename().to_string_lossy().into_owned();
+        let (audience, closing) = (Arc::new(Audience::default()), CancellationToken::new());
+        let host = Host {
+            context,
+            audience: Arc::clone(&audience),
+            greeting: greeting(registry, controls.is_some())?,
+            controls,
+            origins: Origins { more: origins, machine },
+            limit: connections::LIMIT,
+        };
+        let connections = tokio::spawn(Arc::new(host).serve(listener, closing.clone()));
+        Ok((Self { audience, connections, closing, topics, reported: Stamp::now() }, bound))
     }
 
     /// Serves until `stop`, or until there will be nothing to serve.
@@ -280,7 +284,7 @@ impl Server {
                     yield_now().await;
                     continue;
                 }
-                let is_idle = self.handle.client_count() == 0;
+                let is_idle = self.audience.is_empty();
                 sleep(if is_idle { IDLE_TURN } else { TURN }).await;
             }
         };
@@ -289,12 +293,8 @@ impl Server {
             () = served => {}
         }
         self.closing.cancel();
-        let ended = async {
-            self.handle.stop().wait().await;
-            // It has also ended if it panicked.
-            let _ = self.relay.await;
-        };
-        let _ = timeout(LAST, ended).await;
+        // It has also ended if it panicked.
+        let _ = timeout(LAST, &mut self.connections).await;
     }
 
     /// Whether more waits on the bus.
@@ -343,31 +343,16 @@ impl Server {
     }
 }
 
-/// Counts the clients, and refuses the subscriptions of too many.
-struct Audience {
-    context: Weak<Context>,
-    clients: AtomicUsize,
-}
-
-impl ServerListener for Audience {
-    fn on_subscribe(&self, client: Client, channel: ChannelView) {
-        if self.clients.load(Ordering::Relaxed) <= CLIENTS {
-            return;
-        }
-        if let (Some(context), Some(sink)) = (self.context.upgrade(), client.sink_id()) {
-            context.unsubscribe_channels(sink, &[channel.id()]);
-        }
-        client
-            .send_status(Status::error(format!("rapid serves {CLIENTS} clients at a time: close one, and try again")));
+/// What each client gets first.
+fn greeting(registry: &Registry, is_controlled: bool) -> Result<Vec<Message>, EncodeError> {
+    let mut info = ServerInfo::new(format!("rapid {}", registry.rig.name)).with_session_id(Stamp::now().0.to_string());
+    if is_controlled {
+        info = info.with_capabilities([Capability::Services, Capability::Parameters]);
+        info = info.with_supported_encodings([control::JSON]);
     }
-
-    fn on_client_connect(&self) {
-        let clients = self.clients.fetch_add(1, Ordering::Relaxed) + 1;
-        tracing::info!("Foxglove: a client has connected, {clients} now");
+    let mut greeting = vec![Message::from(&info)];
+    if is_controlled {
+        greeting.push(Controls::services()?);
     }
-
-    fn on_client_disconnect(&self) {
-        let clients = self.clients.fetch_sub(1, Ordering::Relaxed).saturating_sub(1);
-        tracing::info!("Foxglove: a client has disconnected, {clients} now");
-    }
+    Ok(greeting)
 }

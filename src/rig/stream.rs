@@ -40,7 +40,7 @@ const SILENT_AFTER: Duration = Duration::from_secs(2);
 /// Cameras and programs always send: one that has sent nothing for this long after opening is reopened. Six of these
 /// and the delays between them fit into the minute in which five restarts are allowed.
 const START_LIMIT: Duration = Duration::from_secs(5);
-/// How often the clock of another computer is reported: in each episode that is long enough to be used.
+/// How often the clock of a phone or of another computer is reported: in each episode that is long enough to be used.
 const CLOCK_EVERY: Duration = Duration::from_millis(500);
 /// How long the orderly closing of a device may take.
 const CLOSE_LIMIT: Duration = Duration::from_secs(4);
@@ -63,7 +63,7 @@ pub(super) enum Report {
     /// Samples or actions are lost, or an order is refused, and why; reported once per epoch each.
     Refused(String),
     Actuator(ActuatorNotice),
-    /// The clock of the computer that the device is on, with the worst uncertainty since the last report.
+    /// The clock of the phone, or of the computer that the device is on, with the worst uncertainty since the last report.
     Clock(ClockOffset),
     /// What the device does that records by itself.
     Clip(ClipNotice),
@@ -366,7 +366,7 @@ struct StreamProgress {
     has_lost: bool,
     /// An action was refused.
     has_refused: bool,
-    /// When the clock of another computer was last reported, and the worst uncertainty since.
+    /// When the clock of the device was last reported, and the worst uncertainty since.
     clock: Option<(Instant, u64)>,
 }
 

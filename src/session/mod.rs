@@ -12,6 +12,7 @@
 
 pub mod journal;
 pub mod keeper;
+pub mod noted;
 pub mod trash;
 
 use std::path::{Path, PathBuf};
@@ -21,7 +22,7 @@ use rapid_core::text;
 use rapid_core::time::Stamp;
 
 use journal::{Plan, SessionFile};
-use rapid_status::session::{EpisodeEntry, Label, Mark, Phase, SessionRequest, SessionStatus};
+use rapid_status::session::{EpisodeEntry, Label, Mark, Notes, NotesChange, Phase, SessionRequest, SessionStatus};
 use rapid_status::{Grade, Verdict};
 
 /// Episodes that a screen lists.
@@ -30,10 +31,12 @@ const LISTED: usize = 200;
 const LONGEST_TEXT: usize = 2000;
 
 /// What the owner of a session is to do, in order.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Effect {
     /// Save the journal.
     Save,
+    /// Change the file beside this episode; without one, it begins with these notes.
+    Note(String, Notes, Vec<NotesChange>),
     /// Begin an episode, and report it with [`Session::began`].
     Begin,
     /// End the episode in progress at this moment. Its end is reported with [`Session::ended`].
@@ -114,8 +117,8 @@ struct Shown<'a> {
     session: &'a SessionStatus,
 }
 
-/// See the module's comment.
-#[derive(Debug)]
+/// See the module's comment. A copy is what it was, for an order that cannot be carried out.
+#[derive(Debug, Clone)]
 pub struct Session {
     folder: PathBuf,
     file: SessionFile,
@@ -134,8 +137,8 @@ pub struct Session {
 }
 
 impl Session {
-    /// A session in `folder` by `plan`. It continues `before`, the session in progress there, if that has the same task;
-    /// otherwise the second value is true, and `before` is to be archived. No episode gets a name of `earlier` ones.
+    /// A session in `folder` by `plan`. It continues `before`, a session in progress there, if that has the same task;
+    /// otherwise the second value is true. No episode gets a name of `earlier` ones.
     pub fn new(
         folder: &Path,
         plan: Plan,
@@ -143,12 +146,13 @@ impl Session {
         earlier: Vec<String>,
         begun: String,
     ) -> (Self, bool) {
-        let continued = before.filter(|before| before.plan.task == plan.task);
+        let continued = before.filter(|before| before.has(&plan.task));
         let is_new = continued.is_none();
         let episodes = continued.as_ref().map(|before| before.episodes.clone()).unwrap_or_default();
         let begun = continued.as_ref().map_or(begun, |before| before.begun.clone());
         let has_own_goal = plan.goal.is_some();
-        let goal = plan.goal.or_else(|| continued?.plan.goal);
+        // A goal is one of a task.
+        let goal = plan.goal.or_else(|| continued.filter(|before| before.plan.task == plan.task)?.plan.goal);
         let discarded = (0..episodes.len()).filter(|index| episodes.get(*index).is_some_and(|e| e.discarded)).collect();
         let file = SessionFile { begun, plan: Plan { goal, ..plan }, episodes, ..SessionFile::default() };
         let session = Self {
@@ -192,9 +196,10 @@ impl Session {
         self.phase
     }
 
-    /// How many episodes count for the goal.
+    /// How many episodes of the task count for the goal.
     pub fn counted(&self) -> usize {
-        self.file.episodes.iter().filter(|episode| episode.counts()).count()
+        let task = &self.file.plan.task;
+        self.file.episodes.iter().filter(|episode| episode.counts() && episode.task == *task).count()
     }
 
     /// Whether there is a goal and it is reached.
@@ -243,17 +248,12 @@ impl Session {
             SessionRequest::Undo => self.undo(),
             SessionRequest::Mark { text } => self.mark(text, now),
             SessionRequest::Label { episode, label, reason } => {
-                let entry = self.about(episode.as_deref(), reason)?;
-                entry.label = Some(*label);
-                entry.label_reason.clone_from(reason);
-                let text = format!("{}: {label}", entry.file);
-                Ok((Answer::Now(text), vec![Effect::Save]))
+                let change = NotesChange::Label(Some(*label), reason.clone());
+                self.note(episode.as_deref(), reason, change, &label.to_string())
             }
             SessionRequest::Note { episode, text } => {
-                let entry = self.about(episode.as_deref(), text)?;
-                entry.note.clone_from(text);
-                let text = format!("{}: {}", entry.file, if text.is_empty() { "note removed" } else { "noted" });
-                Ok((Answer::Now(text), vec![Effect::Save]))
+                let done = if text.is_empty() { "note removed" } else { "noted" };
+                self.note(episode.as_deref(), text, NotesChange::Note(text.clone()), done)
             }
             SessionRequest::Plan { task: Some(task), .. } if task.trim().is_empty() => Err(Refusal::NoTask),
             SessionRequest::Plan { task, tags, goal, .. } => Ok(self.change_plan(task.as_deref(), tags, *goal)),
@@ -275,7 +275,8 @@ impl Session {
         self.phase = Phase::Recording;
         self.after = After::default();
         self.current = Some((self.file.episodes.len(), now));
-        self.file.episodes.push(EpisodeEntry::begin(name(file), begun));
+        let task = self.file.plan.task.clone();
+        self.file.episodes.push(EpisodeEntry { task, ..EpisodeEntry::begin(name(file), begun) });
         vec![Effect::Save]
     }
 
@@ -288,6 +289,7 @@ impl Session {
             entry.close(seconds, verdict);
         }
         let mut effects = vec![Effect::Save];
+        effects.extend(self.file.episodes.get(index).and_then(note_beside));
         if discard {
             effects.extend(self.put_away(index));
         }
@@ -319,11 +321,12 @@ impl Session {
         let is_it = |entry: &EpisodeEntry| entry.file == file && entry.verdict.is_none();
         let Some(index) = self.file.episodes.iter().position(is_it) else { return Vec::new() };
         let Some(entry) = self.file.episodes.get_mut(index) else { return Vec::new() };
-        match found {
-            Some((seconds, verdict)) => entry.close(seconds, verdict),
-            None => entry.reasons = vec!["nothing of it was recorded".to_owned()],
-        }
-        vec![Effect::Save]
+        let Some((seconds, verdict)) = found else {
+            entry.reasons = vec!["nothing of it was recorded".to_owned()];
+            return vec![Effect::Save];
+        };
+        entry.close(seconds, verdict);
+        [Effect::Save].into_iter().chain(note_beside(entry)).collect()
     }
 
     /// The session that was to be closed is, at `now`, and another follows by the same plan; or it is not.
@@ -499,14 +502,28 @@ impl Session {
         Ok((Answer::Now(format!("marked at {at:.1} s")), vec![Effect::Mark(text.to_owned()), Effect::Save]))
     }
 
-    /// The entry that a label or a note is about.
-    fn about(&mut self, episode: Option<&str>, text: &str) -> Result<&mut EpisodeEntry, Refusal> {
+    /// Changes what is noted about an episode. While it is recorded, that is in the journal alone.
+    fn note(
+        &mut self,
+        episode: Option<&str>,
+        text: &str,
+        change: NotesChange,
+        done: &str,
+    ) -> Result<(Answer, Vec<Effect>), Refusal> {
         if text.len() > LONGEST_TEXT {
             return Err(Refusal::TooLong);
         }
-        let newest = || self.current.map(|(index, _)| index).or_else(|| self.last()).ok_or(Refusal::NoEpisode);
+        let current = self.current.map(|(index, _)| index);
+        let newest = || current.or_else(|| self.last()).ok_or(Refusal::NoEpisode);
         let index = episode.map_or_else(newest, |file| self.find(file))?;
-        self.file.episodes.get_mut(index).ok_or(Refusal::NoEpisode)
+        let entry = self.file.episodes.get_mut(index).ok_or(Refusal::NoEpisode)?;
+        let before = entry.notes();
+        let mut notes = before.clone();
+        notes.apply(&change);
+        entry.set_notes(notes);
+        let (answer, file) = (Answer::Now(format!("{}: {done}", entry.file)), entry.file.clone());
+        let beside = (current != Some(index)).then(|| Effect::Note(file, before, vec![change]));
+        Ok((answer, beside.into_iter().chain([Effect::Save]).collect()))
     }
 
     /// The last episode that is kept.
@@ -545,9 +562,7 @@ impl Session {
         let goal = plan.goal.map(|goal| format!(", {} wanted", text::counted(goal.into(), "episode")));
         let goal = goal.unwrap_or_default();
         let text = format!("task {:?}{}{goal}", plan.task, tags.concat());
-        // A session without episodes leaves no file.
-        let save = (!self.file.episodes.is_empty()).then_some(Effect::Save);
-        (Answer::Now(text), save.into_iter().collect())
+        (Answer::Now(text), vec![Effect::Save])
     }
 
     fn end_session(&mut self) -> Result<(Answer, Vec<Effect>), Refusal> {
@@ -565,7 +580,7 @@ impl Session {
         let text = format!("session ended: {kept} kept, {} deleted", gone.len());
         self.phase = Phase::Idle;
         self.closing = true;
-        Ok((Answer::Now(text), vec![Effect::Close(gone)]))
+        Ok((Answer::Now(text), vec![Effect::Save, Effect::Close(gone)]))
     }
 
     /// What is saved of a session that ends at `ended`: without what is deleted.
@@ -591,7 +606,7 @@ pub fn markdown(file: &SessionFile) -> String {
         page,
         "{}, {} in all: {} GOOD, {} SUSPECT, {} BAD{goal}. Begun {}.\n",
         text::counted(kept.len() as u64, "episode"),
-        text::about(Duration::from_secs_f64(seconds.max(0.0))),
+        text::about(Duration::try_from_secs_f64(seconds).unwrap_or_default()),
         of(Grade::Good),
         of(Grade::Suspect),
         of(Grade::Bad),
@@ -614,6 +629,12 @@ pub fn markdown(file: &SessionFile) -> String {
         );
     }
     page
+}
+
+/// What people noted about an episode while it was recorded, for the file beside it.
+fn note_beside(entry: &EpisodeEntry) -> Option<Effect> {
+    let changes = entry.notes().into_changes();
+    (!changes.is_empty()).then(|| Effect::Note(entry.file.clone(), Notes::default(), changes))
 }
 
 fn name(file: &Path) -> String {

@@ -80,6 +80,7 @@ impl Owner {
                     self.carry_out(effects);
                 }
                 Effect::Mark(_) => assert!(self.recording.is_some()),
+                Effect::Note(file, ..) => assert_ne!(self.recording.as_ref(), Some(&file), "it has no name yet"),
                 Effect::Close(_) if self.stuck => self.session.closed(false, "t1".to_owned()),
                 Effect::Close(gone) => {
                     for file in gone {

@@ -370,6 +370,11 @@ impl Board {
 
     /// Announces an event, now, to all subscribers, and adds it to the log.
     pub fn announce(&self, what: EventKind) {
+        self.announce_at(Stamp::now(), what);
+    }
+
+    /// The same for an event of an earlier moment.
+    pub fn announce_at(&self, stamp: Stamp, what: EventKind) {
         let line = what.log_line().map(|(level, text)| {
             let (device, printed) = what.source();
             plain(level, &text, device, printed)
@@ -383,7 +388,7 @@ impl Board {
             state.episodes.note(&what);
         }
         // An error only means that there is no subscriber.
-        let _ = self.events.send(Event { stamp: Stamp::now(), what });
+        let _ = self.events.send(Event { stamp, what });
     }
 
     /// The episodes of this run.

@@ -168,7 +168,7 @@ pub enum EventKind {
     },
     /// The policy ended.
     PolicyEnd(PolicyEnd),
-    /// The clock of the computer that a device is on, twice a second while its samples arrive.
+    /// The clock of a phone, or of the computer that a device is on, twice a second while its samples arrive.
     Clock {
         /// Modality.
         device: String,
@@ -427,7 +427,7 @@ impl EventKind {
             }
             Self::Clock { device, bit, offset_ns, uncertainty_ns } => {
                 let (offset, within) = (*offset_ns as f64 / 1e9, *uncertainty_ns as f64 / 1e6);
-                let rest = format!("of its computer is {offset:+.6} s from this one, within {within:.3} ms");
+                let rest = format!("of the device is {offset:+.6} s from this one, within {within:.3} ms");
                 D::joined(Level::Debug, device, "clock", " ", &rest).with_bit(*bit)
             }
             Self::Clip { device, bit, state, text } => {

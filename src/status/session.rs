@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rapid_core::time::Stamp;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, de};
 use tokio::sync::oneshot;
 
 use super::{Grade, Sensors, Verdict};
@@ -134,10 +134,97 @@ impl fmt::Display for Label {
 #[serde(deny_unknown_fields)]
 pub struct Mark {
     /// Seconds since the beginning of the episode.
+    #[serde(deserialize_with = "seconds")]
     pub at: f64,
     /// What it is; empty if nothing was given.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub text: String,
+}
+
+/// What people noted about an episode.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Notes {
+    /// Whether the demonstration succeeded.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub label: Option<Label>,
+    /// Why it has this label.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub label_reason: String,
+    /// A note.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub note: String,
+    /// Marked moments, by time.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub marks: Vec<Mark>,
+}
+
+impl Notes {
+    /// Nothing was noted.
+    pub fn is_empty(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// Takes over a change.
+    pub fn apply(&mut self, change: &NotesChange) {
+        match change {
+            NotesChange::Label(label, reason) => {
+                self.label = *label;
+                self.label_reason.clone_from(reason);
+            }
+            NotesChange::Note(text) => self.note.clone_from(text),
+            NotesChange::Mark(mark) if self.marks.contains(mark) => {}
+            NotesChange::Mark(mark) => {
+                self.marks.push(mark.clone());
+                self.marks.sort_by(|a, b| a.at.total_cmp(&b.at));
+            }
+        }
+    }
+
+    /// What makes nothing to this.
+    pub fn into_changes(self) -> Vec<NotesChange> {
+        let label = self.label.map(|label| NotesChange::Label(Some(label), self.label_reason));
+        let note = (!self.note.is_empty()).then_some(NotesChange::Note(self.note));
+        label.into_iter().chain(note).chain(self.marks.into_iter().map(NotesChange::Mark)).collect()
+    }
+}
+
+/// One change of what is noted about an episode.
+#[derive(Debug, Clone, PartialEq)]
+pub enum NotesChange {
+    /// A label with its reason, or none any more.
+    Label(Option<Label>, String),
+    /// A note; an empty one removes it.
+    Note(String),
+    /// One more marked moment.
+    Mark(Mark),
+}
+
+/// Longest time within an episode, or length of one, in seconds: some 30 years. A longer one is a mistake.
+const LONGEST: f64 = 1e9;
+
+/// A time in seconds that a computation can rely on.
+fn seconds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    let seconds = f64::deserialize(deserializer)?;
+    let wrong = || de::Error::custom(format!("{seconds} is no time in seconds: write a number from 0 to {LONGEST}"));
+    (0.0..=LONGEST).contains(&seconds).then_some(seconds).ok_or_else(wrong)
+}
+
+fn some_seconds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<f64>, D::Error> {
+    struct Seconds;
+    impl<'de> de::Visitor<'de> for Seconds {
+        type Value = Option<f64>;
+        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            f.write_str("a time in seconds")
+        }
+        fn visit_none<E>(self) -> Result<Self::Value, E> {
+            Ok(None)
+        }
+        fn visit_some<D: Deserializer<'de>>(self, deserializer: D) -> Result<Self::Value, D::Error> {
+            seconds(deserializer).map(Some)
+        }
+    }
+    deserializer.deserialize_option(Seconds)
 }
 
 /// One episode of a session.
@@ -146,10 +233,13 @@ pub struct Mark {
 pub struct EpisodeEntry {
     /// Name of its file.
     pub file: String,
+    /// What it is of; empty if that is not known.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub task: String,
     /// When it began, RFC 3339, UTC.
     pub begun: String,
     /// Its length in seconds; absent while it is recorded, and if `rapid` was killed then.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "some_seconds")]
     pub seconds: Option<f64>,
     /// Its verdict; absent likewise.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -185,6 +275,7 @@ impl EpisodeEntry {
     pub const fn begin(file: String, begun: String) -> Self {
         Self {
             file,
+            task: String::new(),
             begun,
             seconds: None,
             verdict: None,
@@ -205,6 +296,19 @@ impl EpisodeEntry {
         self.verdict = Some(verdict.grade);
         self.reasons.clone_from(&verdict.reasons);
         self.sensors.clone_from(&verdict.sensors);
+        self.replay_of.clone_from(&verdict.replay_of);
+    }
+
+    /// What people noted about it.
+    pub fn notes(&self) -> Notes {
+        let Self { label, label_reason, note, marks, .. } = self;
+        Notes { label: *label, label_reason: label_reason.clone(), note: note.clone(), marks: marks.clone() }
+    }
+
+    /// Takes over what people noted about it.
+    pub fn set_notes(&mut self, notes: Notes) {
+        let Notes { label, label_reason, note, marks } = notes;
+        (self.label, self.label_reason, self.note, self.marks) = (label, label_reason, note, marks);
     }
 
     /// Whether it counts for the goal: it is closed and kept, and not BAD.

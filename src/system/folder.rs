@@ -11,13 +11,15 @@
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
 use std::io::{self, Read, Write};
-use std::os::fd::{AsFd, OwnedFd};
+use std::os::fd::{AsFd, AsRawFd, OwnedFd};
 use std::os::unix::ffi::OsStringExt;
 use std::path::{Component, Path, PathBuf};
 
 use rapid_core::time::realtime_ns;
 use rustix::fs::{AtFlags, CWD, FileType, Mode, OFlags, RenameFlags, Stat};
 use rustix::io::Errno;
+
+use crate::fault;
 
 /// Links on one path before it is taken for a loop; as in Linux, see `path_resolution(7)`.
 const MOST_LINKS: usize = 40;
@@ -121,6 +123,54 @@ impl Folder {
         Ok(Self { open, path: path.to_owned() })
     }
 
+    /// Opens a folder in this one; a link is refused.
+    ///
+    /// # Errors
+    /// When it does not exist and may not be created, or is not a folder.
+    pub fn subfolder(&self, name: &str, missing: Missing) -> Result<Self, FolderError> {
+        let path = self.path.join(name);
+        let io = |error: io::Error| FolderError::Io { path: path.clone(), error };
+        let flags = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC;
+        let open = || rustix::fs::openat(&self.open, name, flags, Mode::empty());
+        let opened = match open() {
+            Err(Errno::NOENT) if missing != Missing::Refused => {
+                fault::change(&self.path).map_err(io)?;
+                match rustix::fs::mkdirat(&self.open, name, Mode::from_raw_mode(0o755)) {
+                    Ok(()) | Err(Errno::EXIST) => open(),
+                    Err(error) => Err(error),
+                }
+            }
+            opened => opened,
+        };
+        match opened {
+            Ok(open) => Ok(Self { open, path }),
+            Err(Errno::LOOP | Errno::NOTDIR) => {
+                let stat = rustix::fs::statat(&self.open, name, AtFlags::SYMLINK_NOFOLLOW)
+                    .map_err(|error| io(error.into()))?;
+                let is_link = FileType::from_raw_mode(stat.st_mode) == FileType::Symlink;
+                Err(if is_link { FolderError::Link { path, owner: stat.st_uid } } else { FolderError::NoFolder(path) })
+            }
+            Err(error) => Err(io(error.into())),
+        }
+    }
+
+    /// Where it is now, if not at its path: it was moved while it was open. `None` also if it was removed.
+    pub fn moved_to(&self) -> Option<PathBuf> {
+        let own = rustix::fs::fstat(&self.open).ok()?;
+        let is_it = |path: &Path| {
+            rustix::fs::stat(path).is_ok_and(|named| (named.st_dev, named.st_ino) == (own.st_dev, own.st_ino))
+        };
+        if self.is_removed() || is_it(&self.path) {
+            return None;
+        }
+        std::fs::read_link(format!("/proc/self/fd/{}", self.open.as_raw_fd())).ok().filter(|path| is_it(path))
+    }
+
+    /// Whether it was removed while it was open.
+    pub fn is_removed(&self) -> bool {
+        rustix::fs::fstat(&self.open).is_ok_and(|own| own.st_nlink == 0)
+    }
+
     /// Its path, as it was named.
     pub fn path(&self) -> &Path {
         &self.path
@@ -136,6 +186,7 @@ impl Folder {
     /// # Errors
     /// `AlreadyExists` when anything has that name, including a dangling link.
     pub fn create_new(&self, name: impl AsRef<OsStr>, mode: u32) -> io::Result<File> {
+        fault::change(&self.path)?;
         let flags = OFlags::RDWR | OFlags::CREATE | OFlags::EXCL | OFlags::NOFOLLOW | OFlags::CLOEXEC;
         let file = rustix::fs::openat(&self.open, name.as_ref(), flags, Mode::from_raw_mode(mode))?;
         Ok(File::from(file))
@@ -159,7 +210,7 @@ impl Folder {
     /// # Errors
     /// When the disk does not accept it, or the name belongs to something that cannot be replaced.
     pub fn replace(&self, name: impl AsRef<OsStr>, contents: &[u8], mode: u32, sync: Sync) -> io::Result<()> {
-        self.replace_with(name.as_ref(), contents, Some(mode), sync)
+        self.replace_with(name.as_ref(), contents, Some(mode), sync).map(drop)
     }
 
     /// The same, with the permissions that the umask leaves of 0666, as any new file has.
@@ -167,23 +218,34 @@ impl Folder {
     /// # Errors
     /// As [`Self::replace`].
     pub fn replace_by_umask(&self, name: impl AsRef<OsStr>, contents: &[u8], sync: Sync) -> io::Result<()> {
+        self.replace_with(name.as_ref(), contents, None, sync).map(drop)
+    }
+
+    /// The same; the file is returned, and is locked (flock) before it has its name, where the file system has locks.
+    ///
+    /// # Errors
+    /// As [`Self::replace`].
+    pub fn replace_locked(&self, name: impl AsRef<OsStr>, contents: &[u8], sync: Sync) -> io::Result<File> {
         self.replace_with(name.as_ref(), contents, None, sync)
     }
 
-    fn replace_with(&self, name: &OsStr, contents: &[u8], mode: Option<u32>, sync: Sync) -> io::Result<()> {
+    fn replace_with(&self, name: &OsStr, contents: &[u8], mode: Option<u32>, sync: Sync) -> io::Result<File> {
         let (temporary, file) = self.temporary(name, if mode.is_some() { 0o600 } else { 0o666 })?;
+        // Nobody else knows it yet, and whoever does not keep it ends the lock.
+        let _ = file.try_lock();
         let set_mode = |mode: u32| rustix::fs::fchmod(&file, Mode::from_raw_mode(mode));
-        let written = (&file)
-            .write_all(contents)
+        let written = fault::change(&self.path)
+            .and_then(|()| (&file).write_all(contents))
             // The umask may have taken bits away.
             .and_then(|()| Ok(mode.map_or(Ok(()), set_mode)?))
             .and_then(|()| if sync == Sync::Wait { file.sync_all() } else { Ok(()) })
+            .and_then(|()| fault::change(&self.path))
             .and_then(|()| Ok(rustix::fs::renameat(&self.open, &temporary, &self.open, name)?));
         if written.is_err() {
             // The unfinished file is of no use; the first error is the one to report.
             let _ = self.remove(&temporary);
         }
-        written
+        written.map(|()| file)
     }
 
     fn temporary(&self, name: &OsStr, mode: u32) -> io::Result<(OsString, File)> {
@@ -219,6 +281,7 @@ impl Folder {
     /// # Errors
     /// `AlreadyExists` when the new name is taken.
     pub fn move_new(&self, from: &OsStr, into: &Self, to: &OsStr) -> io::Result<()> {
+        fault::change(&self.path)?;
         match rustix::fs::renameat_with(&self.open, from, &into.open, to, RenameFlags::NOREPLACE) {
             Ok(()) => Ok(()),
             // A file system without the flag (NFS, some FUSE): checked instead.

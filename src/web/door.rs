@@ -10,12 +10,11 @@
 //! Invariant: nothing but the page itself, which holds no secret, is sent to a client that has not shown the token, if one is
 //! needed.
 
-use std::net::IpAddr;
-
 use hyper::header::{COOKIE, HOST, HeaderMap, HeaderName, ORIGIN};
 use hyper::{Method, StatusCode};
+use rapid_core::site;
 
-use super::token::Token;
+use super::token::Source;
 
 /// Why a request is not answered: the status, and why in words.
 pub(super) type Refusal = (StatusCode, &'static str);
@@ -23,7 +22,7 @@ pub(super) type Refusal = (StatusCode, &'static str);
 #[derive(Debug)]
 pub(super) struct Door {
     /// `None`: none is needed.
-    pub(super) token: Option<Token>,
+    pub(super) token: Option<Source>,
     /// The name of this machine.
     pub(super) machine: String,
     /// Ports of a host share its cookies: the port is part of the name.
@@ -58,11 +57,8 @@ impl Door {
                 return Err(FOREIGN);
             }
         }
-        if method == Method::POST {
-            let origin = text(ORIGIN).and_then(|origin| origin.split_once("://"));
-            if origin.is_none_or(|(_, of)| of != host) {
-                return Err(FOREIGN);
-            }
+        if method == Method::POST && text(ORIGIN).is_none_or(|origin| !site::is_page_of(origin, host)) {
+            return Err(FOREIGN);
         }
         if asked == Asked::Rig && !self.has_token(headers) {
             return Err(NO_TOKEN);
@@ -72,16 +68,19 @@ impl Door {
 
     /// Whether the client has shown the token, or needs none.
     pub(super) fn has_token(&self, headers: &HeaderMap) -> bool {
-        let Some(token) = &self.token else { return true };
+        let Some(source) = &self.token else { return true };
         let cookies = headers.get_all(COOKIE).iter().filter_map(|value| value.to_str().ok());
         let pairs = cookies.flat_map(|cookies| cookies.split("; ")).filter_map(|cookie| cookie.split_once('='));
         let own = self.cookie_name();
-        pairs.filter(|(name, _)| *name == own).any(|(_, value)| token.is(value))
+        let mut shown = pairs.filter(|(name, _)| *name == own).peekable();
+        // The file is not read for those who show nothing.
+        let token = shown.peek().and_then(|_| source.token());
+        token.is_some_and(|token| shown.any(|(_, value)| token.is(value)))
     }
 
     /// The cookie of a client that has shown this token; `None` if it is the wrong one.
     pub(super) fn cookie(&self, shown: &str) -> Option<String> {
-        let token = self.token.as_ref().filter(|token| token.is(shown))?;
+        let token = self.token.as_ref()?.token().filter(|token| token.is(shown))?;
         // A month: with a token that is kept in a file, phones come back.
         Some(format!("{}={}; Max-Age=2592000; Path=/; HttpOnly; SameSite=Strict", self.cookie_name(), token.text()))
     }
@@ -90,17 +89,9 @@ impl Door {
         format!("rapid-{}", self.port)
     }
 
-    /// Whether `Host` names this machine: with any port, as `ssh -L` has another.
+    /// Whether `Host` names this machine. Others may answer for its name; they do not have its token.
     fn is_own(&self, host: &str) -> bool {
-        let name = match host.rsplit_once(':') {
-            Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) => name,
-            _ => host,
-        };
-        let address = name.strip_prefix('[').and_then(|name| name.strip_suffix(']')).unwrap_or(name);
-        let is_name = |own: &str| !own.is_empty() && name.eq_ignore_ascii_case(own);
-        // Others may answer for the name of this machine; they do not have its token.
-        let is_machine = || is_name(&self.machine) || is_name(&format!("{}.local", self.machine));
-        address.parse::<IpAddr>().is_ok() || is_name("localhost") || (self.token.is_some() && is_machine())
+        site::is_own(host, self.token.is_some().then_some(&self.machine))
     }
 }
 
@@ -115,13 +106,14 @@ pub(super) const NO_TOKEN: Refusal = (
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::token::Token;
 
     fn headers(of: &[(&'static str, &str)]) -> HeaderMap {
         of.iter().map(|(name, value)| (HeaderName::from_static(name), value.parse().unwrap())).collect()
     }
 
     fn door(token: Option<&Token>) -> Door {
-        Door { token: token.cloned(), machine: "rig7".to_owned(), port: 8766 }
+        Door { token: token.cloned().map(Source::Run), machine: "rig7".to_owned(), port: 8766 }
     }
 
     #[test]

@@ -2,8 +2,8 @@
 //! discard and label an episode.
 //!
 //! Thread `web` has everything: the server with its connections, and the encoder of small pictures. It sees what a screen
-//! sees, the board, and requests what a screen may request. It has a port of its own: Foxglove's is that crate's, whose
-//! server answers websockets and nothing else.
+//! sees, the board, and requests what a screen may request. It has a port of its own: Foxglove's has no
+//! token, and answers websockets and nothing else.
 //!
 //! Invariant: nothing else waits for this thread: a client that reads slowly gets fewer views, and one that does not read
 //! is left (`serve`).
@@ -35,8 +35,8 @@ use door::Door;
 use rapid_status::session::Asker;
 use rapid_status::{Board, EventKind, Level};
 use serve::Server;
-use token::Token;
 pub use token::TokenError;
+use token::{Source, Token};
 
 /// Bytes that the kernel holds for one client, at most; more would be old when it reads on.
 const SEND_BUFFER: usize = 64 << 10;
@@ -105,11 +105,11 @@ impl Web {
         let _ = set_socket_send_buffer_size(&listener, SEND_BUFFER);
         let address = listener.local_addr().map_err(failed)?;
         let token = match &options.token {
-            Some(file) => Some(Token::kept(file)?),
+            Some(file) => Some(Source::of_file(file)?),
             None if address.ip().is_loopback() => None,
-            None => Some(Token::random()?),
+            None => Some(Source::of_run()?),
         };
-        announce(&board, address, token.as_ref());
+        announce(&board, address, token.as_ref().and_then(Source::token).as_ref());
         let machine = rustix::system::uname().nodename().to_string_lossy().into_owned();
         let door = Door { token, machine, port: address.port() };
         let (stop, ended) = (CancellationToken::new(), CancellationToken::new());
@@ -120,7 +120,7 @@ impl Web {
             let _guard = guard;
             // Only less of the processor is a change that no system refuses.
             let _ = rustix::process::setpriority_process(None, NICE);
-            let server = Rc::new(Server::new(door, shown, ask));
+            let server = Rc::new(Server::new(door, address, shown, ask));
             LocalSet::new().block_on(&runtime, async {
                 let Ok(listener) = tokio::net::TcpListener::from_std(listener) else { return };
                 tokio::select! {
@@ -155,6 +155,22 @@ impl Drop for Web {
         self.stop.cancel();
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
+        }
+    }
+}
+
+/// Another token is in force, or none: the board gets its links, and the log says so.
+fn renewed(board: &Board, address: SocketAddr, token: &Result<Token, TokenError>) {
+    match token {
+        Ok(token) => {
+            board.set_links(links::links(address, Some(token)));
+            let text = "page: the file of --web-token has another token: links and phones of before are locked out; in the \
+                        monitor, W shows the new link";
+            board.log(Level::Info, text);
+        }
+        Err(error) => {
+            board.set_links(Vec::new());
+            board.log(Level::Warn, &format!("page: nobody is let in until this is mended: {error}"));
         }
     }
 }

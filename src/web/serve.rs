@@ -10,6 +10,8 @@
 //!
 //! Invariant: a connection that requests nothing and takes nothing for [`STUCK`] is closed; there are [`CONNECTIONS`] at
 //! most, and each holds a few messages.
+//! Invariant: those who have not got anything of the rig keep nobody out: when all places are in use, one of them gives way.
+//! Invariant: nothing is sent to who is not let in any more: each message of a stream needs the token in force.
 
 use std::cell::{Cell, RefCell};
 use std::convert::Infallible;
@@ -23,7 +25,7 @@ use std::time::Duration;
 
 use http_body_util::{BodyExt as _, Collected, Limited};
 use hyper::body::{Body, Bytes, Frame, Incoming, SizeHint};
-use hyper::header::{CONTENT_TYPE, HeaderName, HeaderValue, SET_COOKIE};
+use hyper::header::{CONTENT_TYPE, HeaderMap, HeaderName, HeaderValue, SET_COOKIE};
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper::{Method, Request, Response, StatusCode};
@@ -36,12 +38,13 @@ use rapid_status::rates::Rates;
 use rapid_status::session::{Asker, SessionRequest};
 use rapid_system::fault;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{mpsc, oneshot, watch};
+use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tokio::task::spawn_local;
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep, sleep_until};
 
 use super::door::{Asked, Door, NO_TOKEN, Refusal};
 use super::pictures::Pictures;
+use super::token::Source;
 use super::view::View;
 
 /// Connections at a time: a page has two to six.
@@ -90,22 +93,20 @@ pub(super) struct Server {
     views: watch::Sender<Arc<str>>,
     rates: RefCell<Rates>,
     pictures: RefCell<Pictures>,
-    connections: Cell<usize>,
+    /// The oldest first.
+    connections: RefCell<Vec<Rc<Connection>>>,
+    address: SocketAddr,
 }
 
 /// The place of a connection, which is free again when this is dropped, by a panic too.
-struct ConnectionGuard(Rc<Server>);
-
-impl ConnectionGuard {
-    fn new(server: &Rc<Server>) -> Self {
-        server.connections.set(server.connections.get() + 1);
-        Self(Rc::clone(server))
-    }
+struct Place {
+    server: Rc<Server>,
+    connection: Rc<Connection>,
 }
 
-impl Drop for ConnectionGuard {
+impl Drop for Place {
     fn drop(&mut self) {
-        self.0.connections.set(self.0.connections.get().saturating_sub(1));
+        self.server.connections.borrow_mut().retain(|other| !Rc::ptr_eq(other, &self.connection));
     }
 }
 
@@ -116,13 +117,17 @@ struct Connection {
     last: Cell<Instant>,
     /// It waits for an answer of the run.
     waits: Cell<bool>,
+    /// The last request for something of the rig was admitted.
+    is_let_in: Cell<bool>,
+    /// Another one has its place.
+    gives_way: Notify,
 }
 
 impl Server {
-    pub(super) fn new(door: Door, board: Arc<Board>, ask: Asker) -> Self {
-        let (views, rates, pictures, connections) =
-            (watch::channel("".into()).0, RefCell::default(), RefCell::default(), Cell::new(0));
-        Self { door, board, ask, views, rates, pictures, connections }
+    /// `address` is that of the links.
+    pub(super) fn new(door: Door, address: SocketAddr, board: Arc<Board>, ask: Asker) -> Self {
+        let (rates, pictures, connections) = Default::default();
+        Self { door, board, ask, views: watch::channel("".into()).0, rates, pictures, connections, address }
     }
 
     /// Serves until the future is dropped. In a `LocalSet`.
@@ -137,19 +142,36 @@ impl Server {
                 sleep(PAUSE).await;
                 continue;
             };
-            if self.connections.get() >= CONNECTIONS {
+            let is_full = self.connections.borrow().len() >= CONNECTIONS;
+            if is_full && !self.give_way() {
                 // Not by tokio, which has not heard yet that it can be written to. What does not fit is left out.
                 let _ = stream.into_std().and_then(|mut stream| stream.write_all(FULL));
                 continue;
             }
             // From now on, and not from when its task first runs.
-            let place = ConnectionGuard::new(self);
-            spawn_local(Rc::clone(self).connect(stream, peer, place));
+            let connection = Rc::new(Connection::new(peer));
+            self.connections.borrow_mut().push(Rc::clone(&connection));
+            let place = Place { server: Rc::clone(self), connection };
+            spawn_local(Rc::clone(self).connect(stream, place));
         }
     }
 
-    async fn connect(self: Rc<Self>, stream: TcpStream, peer: SocketAddr, _place: ConnectionGuard) {
-        let connection = Rc::new(Connection { peer, last: Cell::new(Instant::now()), waits: Cell::new(false) });
+    /// Frees the place of one that is not let in: of the address that has most of them, the oldest. Whether there is one.
+    fn give_way(&self) -> bool {
+        let mut connections = self.connections.borrow_mut();
+        let strangers = connections.iter().enumerate().rev().filter(|(_, connection)| !connection.is_let_in.get());
+        let as_many = |(_, connection): &(usize, &Rc<Connection>)| {
+            let is_like = |other: &&Rc<Connection>| other.peer.ip() == connection.peer.ip() && !other.is_let_in.get();
+            connections.iter().filter(is_like).count()
+        };
+        // The last of equals.
+        let Some((number, _)) = strangers.max_by_key(as_many) else { return false };
+        connections.remove(number).gives_way.notify_one();
+        true
+    }
+
+    async fn connect(self: Rc<Self>, stream: TcpStream, place: Place) {
+        let connection = Rc::clone(&place.connection);
         let service = service_fn(|request| {
             let (server, connection) = (Rc::clone(&self), Rc::clone(&connection));
             async move { Ok::<_, Infallible>(server.answer(&connection, request).await) }
@@ -161,6 +183,7 @@ impl Server {
             // What is not HTTP, or a client that has gone, is not an error of the run.
             _ = served => {}
             () = connection.stuck() => {}
+            () = connection.gives_way.notified() => {}
         }
     }
 
@@ -171,6 +194,9 @@ impl Server {
         loop {
             turns.tick().await;
             fault::point("web");
+            if let Some(token) = self.door.token.as_ref().and_then(Source::look) {
+                super::renewed(&self.board, self.address, &token);
+            }
             if self.views.receiver_count() > 0 {
                 self.update_views();
             } else {
@@ -218,7 +244,11 @@ impl Server {
             (None, "/enter") => Asked::Entry,
             (None, _) => Asked::Rig,
         };
-        self.door.admit(asked, request.method(), request.headers())?;
+        let admitted = self.door.admit(asked, request.method(), request.headers());
+        if asked == Asked::Rig {
+            connection.is_let_in.set(admitted.is_ok());
+        }
+        admitted?;
         let is_post = matches!(&*path, "/enter" | "/do");
         if request.method() != if is_post { Method::POST } else { Method::GET } {
             return Err((StatusCode::METHOD_NOT_ALLOWED, "this is requested by another method"));
@@ -228,7 +258,7 @@ impl Server {
         }
         match &*path {
             "/enter" => self.enter(request).await,
-            "/events" => Ok(self.events(connection)),
+            "/events" => Ok(self.events(connection, request.into_parts().0.headers)),
             "/do" => self.obey(connection, request).await,
             _ => {
                 let bit = path.strip_prefix("/picture/").and_then(|bit| bit.parse().ok()).and_then(ModalityId::new);
@@ -253,12 +283,12 @@ impl Server {
     }
 
     /// Views until the connection ends. A client that reads slowly gets fewer of them.
-    fn events(self: &Rc<Self>, connection: &Rc<Connection>) -> Response<Outgoing> {
+    fn events(self: &Rc<Self>, connection: &Rc<Connection>, headers: HeaderMap) -> Response<Outgoing> {
         self.update_views();
         let mut views = self.views.subscribe();
         views.mark_changed();
         let (to, frames) = mpsc::channel(1);
-        let connection = Rc::clone(connection);
+        let (server, connection) = (Rc::clone(self), Rc::clone(connection));
         spawn_local(async move {
             let mut beats = interval(BEAT);
             beats.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -271,6 +301,9 @@ impl Server {
                     },
                     _ = beats.tick() => "event: beat\ndata: 1".to_owned(),
                 };
+                if !server.door.has_token(&headers) {
+                    return connection.is_let_in.set(false);
+                }
                 // By its time a page finds out that it reads an old one.
                 let ms = Stamp::now().0 / 1_000_000;
                 if to.send(format!("id: {ms}\n{event}\n\n").into()).await.is_err() {
@@ -346,6 +379,12 @@ const fn is_offered(request: &SessionRequest) -> bool {
 }
 
 impl Connection {
+    /// From `peer`, now.
+    fn new(peer: SocketAddr) -> Self {
+        let (last, gives_way) = (Cell::new(Instant::now()), Notify::new());
+        Self { peer, last, waits: Cell::new(false), is_let_in: Cell::new(false), gives_way }
+    }
+
     /// Returns when it has been [`STUCK`].
     async fn stuck(&self) {
         loop {

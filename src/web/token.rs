@@ -2,7 +2,9 @@
 //!
 //! Invariant: it has at least 128 random bits, or is as long as such a one; how long a comparison takes does not depend on
 //! where two differ.
+//! Invariant: of a file, what it has now is in force and nothing else: who removes or replaces it locks everybody out at once.
 
+use std::cell::RefCell;
 use std::fs::{self, OpenOptions};
 use std::hint::black_box;
 use std::io::{self, Read as _, Write as _};
@@ -72,30 +74,37 @@ impl Token {
         Ok(Self(bytes.into_iter().map(letter).collect()))
     }
 
+    /// The one in this file. Blocks.
+    ///
+    /// # Errors
+    /// When there is no file, others may read it, or it holds no token.
+    fn read(path: &Path) -> Result<Self, TokenError> {
+        let of_file = |error| TokenError::File { path: path.to_owned(), error };
+        let file = fs::File::open(path).map_err(of_file)?;
+        let about = file.metadata().map_err(of_file)?;
+        if about.is_file() && about.mode() & 0o077 != 0 {
+            return Err(TokenError::Readable { path: path.to_owned() });
+        }
+        let mut text = String::new();
+        file.take(LONGEST as u64 + 2).read_to_string(&mut text).map_err(of_file)?;
+        Self::parse(text.trim_end()).ok_or_else(|| TokenError::Content { path: path.to_owned() })
+    }
+
     /// The one in this file; if there is no file, a new one is written to it. Blocks.
     ///
     /// # Errors
     /// When others may read the file, or it holds no token.
-    pub(super) fn kept(path: &Path) -> Result<Self, TokenError> {
+    fn kept(path: &Path) -> Result<Self, TokenError> {
         let of_file = |error| TokenError::File { path: path.to_owned(), error };
-        match fs::File::open(path) {
-            Ok(file) => {
-                let about = file.metadata().map_err(of_file)?;
-                if about.is_file() && about.mode() & 0o077 != 0 {
-                    return Err(TokenError::Readable { path: path.to_owned() });
-                }
-                let mut text = String::new();
-                file.take(LONGEST as u64 + 2).read_to_string(&mut text).map_err(of_file)?;
-                Self::parse(text.trim_end()).ok_or_else(|| TokenError::Content { path: path.to_owned() })
-            }
-            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+        match Self::read(path) {
+            Err(TokenError::File { error, .. }) if error.kind() == io::ErrorKind::NotFound => {
                 let token = Self::random()?;
                 let mut file =
                     OpenOptions::new().write(true).create_new(true).mode(0o600).open(path).map_err(of_file)?;
                 file.write_all(format!("{}\n", token.0).as_bytes()).map_err(of_file)?;
                 Ok(token)
             }
-            Err(error) => Err(of_file(error)),
+            read => read,
         }
     }
 
@@ -114,6 +123,59 @@ impl Token {
     /// For a link, and for a cookie.
     pub(super) fn text(&self) -> &str {
         &self.0
+    }
+}
+
+/// Where the token in force is.
+#[derive(Debug)]
+pub(super) enum Source {
+    /// With the run.
+    Run(Token),
+    /// In this file, and the one that was there at the last [`Source::look`].
+    File(PathBuf, RefCell<Option<Token>>),
+}
+
+impl Source {
+    /// A new token, for this run.
+    ///
+    /// # Errors
+    /// When the system has no random numbers.
+    pub(super) fn of_run() -> Result<Self, TokenError> {
+        Ok(Self::Run(Token::random()?))
+    }
+
+    /// The token of this file, which is written if there is none. Blocks.
+    ///
+    /// # Errors
+    /// When others may read the file, or it holds no token.
+    pub(super) fn of_file(path: &Path) -> Result<Self, TokenError> {
+        let token = Token::kept(path)?;
+        // A pipe gives it once.
+        let is_file = fs::metadata(path).is_ok_and(|about| about.is_file());
+        Ok(if is_file { Self::File(path.to_owned(), RefCell::new(Some(token))) } else { Self::Run(token) })
+    }
+
+    /// The token in force. `None`: its file has none, and nobody is let in.
+    pub(super) fn token(&self) -> Option<Token> {
+        match self {
+            Self::Run(token) => Some(token.clone()),
+            Self::File(path, _) => Token::read(path).ok(),
+        }
+    }
+
+    /// Replaces the token if its file was removed. `None` if the one in force is that of the last look, or there is none still.
+    ///
+    /// # Errors
+    /// When there is none any more: why.
+    pub(super) fn look(&self) -> Option<Result<Token, TokenError>> {
+        let Self::File(path, last) = self else { return None };
+        let kept = Token::kept(path);
+        let last = last.replace(kept.as_ref().ok().cloned());
+        match &kept {
+            Ok(token) => last.as_ref() != Some(token),
+            Err(_) => last.is_some(),
+        }
+        .then_some(kept)
     }
 }
 
@@ -152,5 +214,30 @@ mod tests {
         }
         assert!(matches!(Token::kept(&folder.path().join("none/token")), Err(TokenError::File { .. })));
         assert!(matches!(Token::kept(folder.path()), Err(TokenError::File { .. })));
+    }
+
+    #[test]
+    fn what_the_file_has_now_is_in_force() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("token");
+        let source = Source::of_file(&path).unwrap();
+        let first = source.token().unwrap();
+        assert!(source.look().is_none());
+        fs::remove_file(&path).unwrap();
+        assert_eq!(source.token(), None);
+        let second = source.look().unwrap().unwrap();
+        assert!(second != first && source.token() == Some(second) && source.look().is_none());
+        // Another one is in force before anybody looks.
+        fs::write(&path, format!("{}\n", first.text())).unwrap();
+        assert_eq!(source.token(), Some(first.clone()));
+        assert_eq!(source.look().unwrap().unwrap(), first);
+        // What would be refused at the start is no token, and reported once.
+        for spoil in [&|| fs::write(&path, "short"), &|| fs::remove_dir_all(folder.path())] as [&dyn Fn() -> _; 2] {
+            fs::write(&path, format!("{}\n", first.text())).unwrap();
+            let _ = source.look();
+            spoil().unwrap();
+            assert_eq!(source.token(), None);
+            assert!(source.look().unwrap().is_err() && source.look().is_none());
+        }
     }
 }

@@ -238,6 +238,7 @@ fn devices_on_the_network_are_parsed() {
     let limits = |name: &str| (far(name).verdict.suspect.uncertain, far(name).verdict.bad.uncertain);
     assert_eq!(limits("cam_far"), (Some(Duration::from_micros(12_500)), None));
     assert_eq!(limits("scan_far"), (Some(Duration::from_millis(30)), Some(Duration::from_secs(1))));
+    assert_eq!([limits("phone"), limits("phone_pose")], [(Some(Duration::from_micros(12_500)), None); 2]);
     assert_eq!(limits("lidar"), (None, None));
     let modality = |name: &str| registry.named(name).unwrap().modality();
     assert_eq!((modality("phone").kind, modality("phone").shape), (ModalityKind::Image, vec![1440, 1920]));

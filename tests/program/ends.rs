@@ -183,6 +183,58 @@ fn a_small_disk_that_fills_up_ends_the_run_with_a_whole_file_and_a_message() {
     assert!(bytes > 1 << 20, "{bytes} bytes recorded before the end");
 }
 
+/// Two cameras of 30 MB a second together.
+const LARGE_RIG: &str = "[rig]\nname = \"large\"\nmemory_budget = \"64MiB\"\n\
+    [device.cam_a]\nvid = \"046d\"\npid = \"0825\"\nserial = \"A\"\nnode = \"camera\"\nbit = 0\ndepth = 16\n\
+    max_bytes = \"600KiB\"\n\
+    [device.cam_b]\nvid = \"046d\"\npid = \"0825\"\nserial = \"B\"\nnode = \"camera\"\nbit = 1\ndepth = 16\n\
+    max_bytes = \"600KiB\"\n";
+const LARGE: &str =
+    "[[device]]\nname = \"cam_a\"\nbytes = \"500kB\"\n[[device]]\nname = \"cam_b\"\nbytes = \"500kB\"\n";
+
+#[test]
+fn an_episode_is_closed_before_its_file_is_larger_than_the_limit_for_files() {
+    let place = Place::new();
+    place.write("devices.toml", LARGE_RIG);
+    place.write("sim.toml", LARGE);
+    // In blocks of 1024 bytes.
+    let arguments =
+        ["--config", "devices.toml", "--sim", "sim.toml", "--headless", "--json", "--record", "--out", "out"];
+    let command = place.command(&arguments);
+    let mut limited = Command::new("bash");
+    limited.args(["-c", "ulimit -f 120000 && exec \"$@\"", "bash"]).arg(command.get_program()).args(command.get_args());
+    limited
+        .current_dir(place.folder.path())
+        .stdin(Stdio::null())
+        .env("HOME", place.folder.path())
+        .env("RAPID_INSTANCE", &place.instance);
+    let ended = limited.output().expect("rapid runs");
+    let (shown, printed) = (String::from_utf8_lossy(&ended.stdout), String::from_utf8_lossy(&ended.stderr));
+    assert_eq!(ended.status.code(), Some(1), "{printed}");
+    let episode = whole_episode(&place, "limited");
+    let reason = episode.value("rapid/summary", "cut_short");
+    assert!(
+        reason.contains("out: ") && reason.contains("122.9 MB") && reason.contains("ulimit -f unlimited"),
+        "{reason}"
+    );
+    assert!(printed.contains(&format!("_001.mcap: {reason}")), "{printed}");
+    // It was said while there was time.
+    assert!(shown.contains("the episode will be closed in about"), "{shown}");
+    let bytes: usize = episode.messages.iter().map(|message| message.data.len()).sum();
+    assert!(bytes > 100_000_000, "{bytes} bytes recorded before the end");
+}
+
+#[test]
+fn a_command_outlives_files_that_are_too_large() {
+    let place = Place::new();
+    let mut command = Command::new("bash");
+    let rapid = place.command(&["keys", "--schema"]);
+    command.args(["-c", "ulimit -f 1; \"$@\" > keys.json", "bash"]).arg(rapid.get_program()).args(rapid.get_args());
+    let ended = command.current_dir(place.folder.path()).output().expect("rapid runs");
+    let printed = String::from_utf8_lossy(&ended.stderr);
+    assert!(ended.status.code() == Some(1) && printed.contains("error: "), "{:?}: {printed}", ended.status);
+}
+
 #[test]
 fn two_signals_exit_with_130_and_the_file_is_whole() {
     let place = Place::new();

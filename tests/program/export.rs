@@ -366,6 +366,8 @@ fn an_interrupted_export_has_the_episodes_so_far() {
         paths: vec![place.path("out")],
         to: Layout::Lerobot,
         out: place.path("set"),
+        verdict: Vec::new(),
+        label: Vec::new(),
         include_bad: true,
         state: Vec::new(),
         action: Vec::new(),
@@ -428,4 +430,66 @@ fn a_killed_export_is_continued_from_every_state_that_it_may_leave() {
     let summary = of(&objects, "export")[0];
     assert_eq!((code, &summary["already"], &summary["exported"]), (0, &1.into(), &1.into()), "{objects:?}");
     assert_eq!((json(&place, "set/meta/info.json"), json(&place, "set/meta/stats.json")), (info, stats));
+}
+
+/// The text of an episode's facts.
+fn fact(place: &Place, episode: usize, key: &str) -> Option<String> {
+    let batch = &rows(place, &format!("set/meta/episodes/chunk-000/file-{episode:03}.parquet"))[0];
+    Some(batch.column_by_name(key)?.as_string::<i32>().value(0).to_owned())
+}
+
+#[test]
+fn label_and_verdict_select_and_labels_and_notes_are_in_the_dataset() {
+    let place = Place::lenient();
+    for duration in ["1s", "1s", "1s", "300ms"] {
+        record(&place, "out", duration, &["--sim"]);
+    }
+    let names = place.episodes("out");
+    let [success, failure, unlabelled, short] = names.as_slice() else { panic!("{names:?}") };
+    let noted = |label: &str, name: &str| {
+        let reason = if label == "failure" { "label_reason = \"slipped\"\nnote = \"new pads\"\n" } else { "" };
+        format!("[[episode]]\nfile = \"{name}\"\nbegun = \"2026-11-24T13:00:00.000Z\"\nlabel = \"{label}\"\n{reason}")
+    };
+    let begin = "begun = \"2026-11-24T13:00:00.000Z\"\n".to_owned();
+    let both = [begin.clone(), noted("success", success), noted("failure", failure), noted("success", short)].concat();
+    place.write("out/session.toml", &both);
+    let selected = |words: &[&str]| {
+        let (objects, code) = export(&place, &[&["out"], words].concat());
+        let summary = of(&objects, "export")[0].clone();
+        let outcomes = outcomes(&objects).into_iter().filter(|(_, outcome)| outcome == "exported");
+        (outcomes.map(|(name, _)| name).collect::<Vec<_>>(), summary["not_selected"].as_u64(), code)
+    };
+    // The short one is BAD; the others are at least SUSPECT.
+    let fit = "good,suspect";
+    assert_eq!(selected(&["--label", "success", "--verdict", fit]), (vec![success.clone()], Some(3), 0));
+    assert_eq!(fact(&place, 0, "rapid/label").as_deref(), Some("success"));
+    assert_eq!(selected(&["--label", "success,none", "--verdict", "BAD"]), (vec![short.clone()], Some(2), 0));
+    // An episode of an earlier version, whose facts have no labels: LeRobot loads only facts of one form.
+    let facts = place.path("set/meta/episodes/chunk-000/file-001.parquet");
+    let batch = rows(&place, "set/meta/episodes/chunk-000/file-001.parquet").remove(0);
+    let keys = ["rapid/label", "rapid/label_reason", "rapid/note", "rapid/marks"];
+    let schema = batch.schema();
+    let kept: Vec<usize> =
+        (0..batch.num_columns()).filter(|at| !keys.contains(&schema.field(*at).name().as_str())).collect();
+    let earlier = batch.project(&kept).expect("columns");
+    let mut writer =
+        parquet::arrow::ArrowWriter::try_new(File::create(&facts).expect("the facts"), earlier.schema(), None)
+            .expect("Parquet");
+    writer.write(&earlier).and_then(|()| writer.close()).expect("written");
+    assert_eq!(fact(&place, 1, "rapid/label"), None);
+    // A label that was changed after the export is in the dataset too, and what is noted beside an episode.
+    let beside = "label = \"failure\"\n[[marks]]\nat = 0.5\ntext = \"grasped\"\n";
+    place.write(&format!("out/{unlabelled}.toml"), beside);
+    place.write("out/session.toml", &[begin, noted("failure", success), noted("failure", failure)].concat());
+    assert_eq!(selected(&[]), (vec![failure.clone(), unlabelled.clone()], Some(0), 0));
+    let facts = |episode| keys.map(|key| fact(&place, episode, key).expect("a text"));
+    assert_eq!(facts(0), ["failure", "slipped", "new pads", ""]);
+    assert_eq!(facts(1), ["", "", "", ""]);
+    assert_eq!(facts(2), ["failure", "slipped", "new pads", ""]);
+    assert_eq!(facts(3), ["failure", "", "", r#"[{"at":0.5,"text":"grasped"}]"#]);
+
+    let none = place.run(&["export", "out", "--to", "lerobot", "--out", "none", "--label", "success"]);
+    let text = String::from_utf8_lossy(&none.stderr).into_owned();
+    assert!(text.contains("none of 4 episodes has what --label and --verdict select"), "{text}");
+    assert_eq!((none.status.code(), place.path("none").exists()), (Some(1), false));
 }

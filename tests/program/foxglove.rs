@@ -19,7 +19,7 @@ use crate::support::{Episode, FrameMessage, LENIENT, MaskMessage, PATIENCE, Plac
 use vbench::emu::lan::lidar;
 
 /// A port that is free: the kernel chooses it.
-const ANY: &str = "127.0.0.1:0";
+pub(crate) const ANY: &str = "127.0.0.1:0";
 /// A run that records until it is interrupted.
 const RECORD: [&str; 8] = ["--sim", "--headless", "--json", "--record", "--out", "out", "--foxglove", ANY];
 /// Of the binary messages of the protocol: samples, and the answers of services.
@@ -35,47 +35,52 @@ struct Channel {
     message: MessageDescriptor,
 }
 
-struct Received {
+pub(crate) struct Received {
     channel: u32,
-    log_time: u64,
+    pub(crate) log_time: u64,
     data: Vec<u8>,
 }
 
 /// A client by the protocol's description (<https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md>).
-struct Client {
+pub(crate) struct Client {
     socket: WebSocket<TcpStream>,
     /// The topic to which it subscribes; every one without it.
     only: Option<&'static str>,
     channels: BTreeMap<u32, Channel>,
     /// Names of the services and their numbers.
     services: BTreeMap<String, u32>,
-    received: Vec<Received>,
+    pub(crate) received: Vec<Received>,
     /// How many of them each channel has: asked after each message.
     counts: BTreeMap<u32, usize>,
     /// Answers of services, and texts of status messages.
-    answers: Vec<Value>,
-    is_open: bool,
+    pub(crate) answers: Vec<Value>,
+    pub(crate) is_open: bool,
 }
 
 impl Client {
     /// Connects, and subscribes to every topic that is advertised.
-    fn connect(address: &str) -> Self {
+    pub(crate) fn connect(address: &str) -> Self {
         Self::connect_for(address, None)
     }
 
     /// Connects, and subscribes to this topic, or to every one.
-    fn connect_for(address: &str, only: Option<&'static str>) -> Self {
+    pub(crate) fn connect_for(address: &str, only: Option<&'static str>) -> Self {
+        Self::try_connect(address, only).expect("a handshake")
+    }
+
+    /// The same; `None` if it is not let in.
+    pub(crate) fn try_connect(address: &str, only: Option<&'static str>) -> Option<Self> {
         let mut request = format!("ws://{address}").into_client_request().expect("a request");
         request.headers_mut().insert("Sec-WebSocket-Protocol", "foxglove.sdk.v1".parse().expect("a header"));
-        let stream = TcpStream::connect(address).expect("a connection");
-        let (socket, _) = tungstenite::client(request, stream).expect("a handshake");
+        let stream = TcpStream::connect(address).ok()?;
+        let (socket, _) = tungstenite::client(request, stream).ok()?;
         socket.get_ref().set_read_timeout(Some(Duration::from_millis(100))).expect("a timeout");
         let (channels, services, received, counts, answers) = Default::default();
-        Self { socket, only, channels, services, received, counts, answers, is_open: true }
+        Some(Self { socket, only, channels, services, received, counts, answers, is_open: true })
     }
 
     /// Takes what has come.
-    fn read(&mut self) {
+    pub(crate) fn read(&mut self) {
         loop {
             match self.socket.read() {
                 Ok(Message::Text(text)) => self.text(&serde_json::from_str(&text).expect("JSON")),
@@ -90,7 +95,7 @@ impl Client {
         }
     }
 
-    fn read_until(&mut self, what: &str, mut holds: impl FnMut(&Self) -> bool) {
+    pub(crate) fn read_until(&mut self, what: &str, mut holds: impl FnMut(&Self) -> bool) {
         let begun = Instant::now();
         while !holds(self) {
             assert!(self.is_open && begun.elapsed() < PATIENCE, "{what}: not met in time: {:?}", self.of_topics());
@@ -106,7 +111,7 @@ impl Client {
     }
 
     /// At most one message: there is always a next one.
-    fn read_one(&mut self) {
+    pub(crate) fn read_one(&mut self) {
         match self.socket.read() {
             Ok(Message::Text(text)) => self.text(&serde_json::from_str(&text).expect("JSON")),
             Ok(Message::Binary(bytes)) => self.binary(&bytes),
@@ -166,7 +171,7 @@ impl Client {
     }
 
     fn send(&mut self, message: &Value) {
-        self.socket.send(Message::text(message.to_string())).expect("it is sent");
+        self.is_open &= self.socket.send(Message::text(message.to_string())).is_ok();
     }
 
     /// Sends a request about parameters; returns what they are then, by name.
@@ -193,7 +198,7 @@ impl Client {
         text.and_then(Value::as_str).unwrap_or_else(|| panic!("no text: {answer}")).to_owned()
     }
 
-    fn count(&self, topic: &str) -> usize {
+    pub(crate) fn count(&self, topic: &str) -> usize {
         self.counts.iter().filter(|(channel, _)| self.channels[channel].topic == topic).map(|(_, count)| count).sum()
     }
 
@@ -204,7 +209,7 @@ impl Client {
 
     /// Asserts that what was received and belongs to an episode is what its file holds, except for what the file counts
     /// as dropped, and returns how many messages of each topic were compared.
-    fn compare(&self, place: &Place, file: &str) -> BTreeMap<&str, usize> {
+    pub(crate) fn compare(&self, place: &Place, file: &str) -> BTreeMap<&str, usize> {
         let path = place.path(file);
         let episode = Episode::read(&path);
         let bytes = std::fs::read(&path).expect("the episode");
@@ -250,18 +255,18 @@ impl Client {
 }
 
 /// Where a run listens.
-fn address(running: &Running) -> String {
+pub(crate) fn address(running: &Running) -> String {
     let reported = running.reported();
     let text = logged(&reported, "Foxglove: open connection ws://").first().copied().expect("an address");
     text.rsplit_once("ws://").expect("an address").1.to_owned()
 }
 
-fn start(place: &Place, options: &[&str]) -> Running {
+pub(crate) fn start(place: &Place, options: &[&str]) -> Running {
     place.start(&[&RECORD[..], options].concat(), "\"event\":\"recording\"")
 }
 
 /// Ends a run that recorded one GOOD episode, and returns its file.
-fn good(place: &Place, running: Running) -> String {
+pub(crate) fn good(place: &Place, running: Running) -> String {
     running.signal(Signal::INT);
     let (code, output, errors) = running.end();
     assert_eq!(code, Some(0), "{output}{errors}");

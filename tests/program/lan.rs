@@ -14,7 +14,7 @@ use crate::support::lan::{
     HEIGHT, Packets, RIG, RUN, Server, WIDTH, camera, camera_entry, free_ports, lidar_rig, life_of, picture, stop,
     wait_for,
 };
-use crate::support::{self, Episode, Place};
+use crate::support::{self, Episode, Place, until};
 use serde_json::Value;
 use vbench::emu::lan::lidar;
 
@@ -157,8 +157,9 @@ const POSE: [f32; 16] = [0.0, 1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0,
 /// The same as a position and a quaternion `x y z w`.
 const PLACE: ([f64; 3], [f64; 4]) = ([0.25, -1.5, 3.0], [0.0, 0.0, FRAC_1_SQRT_2, FRAC_1_SQRT_2]);
 
-/// A phone: connects, names its session, sends frames; connects again when that ends.
-fn phone(port: u16, sends: &AtomicBool) {
+/// A phone: connects, names its session, sends frames; connects again when that ends. By `ahead` its clock is further for
+/// a frame of that number, s.
+fn phone(port: u16, sends: &AtomicBool, ahead: fn(u32) -> f64) {
     while sends.load(Ordering::Relaxed) {
         std::thread::sleep(Duration::from_millis(20));
         let Ok(mut stream) = TcpStream::connect(("127.0.0.1", port)) else { continue };
@@ -173,7 +174,7 @@ fn phone(port: u16, sends: &AtomicBool) {
             let picture = picture(number);
             let mut frame = u32::try_from(picture.len()).expect("short").to_le_bytes().to_vec();
             frame.extend(POSE.iter().flat_map(|number| number.to_le_bytes()));
-            frame.extend(begun.elapsed().as_secs_f64().to_le_bytes());
+            frame.extend((begun.elapsed().as_secs_f64() + ahead(number)).to_le_bytes());
             frame.extend(1.7e9_f64.to_le_bytes());
             frame.extend(picture);
             goes = send(3, b"{}") && send(1, &frame);
@@ -267,22 +268,62 @@ fn check_poses(episode: &Episode) {
     }
 }
 
+fn phone_entry(port: u16, probe: u16, stream: &str) -> String {
+    format!(
+        "{RIG}[device.phone]\nnode = \"lan\"\nbit = 0\n[device.phone.lan]\nprotocol = \"iphone\"\n\
+         host = \"127.0.0.1\"\nport = {port}\nprobe_port = {probe}\nstream = {stream:?}\n\
+         width = {WIDTH}\nheight = {HEIGHT}\n"
+    )
+}
+
+#[test]
+fn a_phone_whose_times_are_wrong_or_uncertain_is_not_good() {
+    let (place, [port, probe]) = (Place::new(), free_ports());
+    place.write("devices.toml", &phone_entry(port, probe, "pose"));
+    let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
+    let _listener = Server::start(probe, drop);
+    let sends = Arc::new(AtomicBool::new(true));
+    let sender = std::thread::spawn({
+        let sends = Arc::clone(&sends);
+        // Its first frames took 200 ms longer than the next ones; one has a time of the future.
+        let ahead = |number| match number {
+            0..10 => 1.0 - 0.2,
+            20 => 51.0,
+            _ => 1.0,
+        };
+        move || phone(port, &sends, ahead)
+    });
+    until("a report after the wrong times", || {
+        let clocks: Vec<_> = running.reported().into_iter().filter(|event| event["event"] == "clock").collect();
+        clocks.len() >= 4 && clocks.iter().any(|event| event["uncertainty_ns"].as_u64() > Some(150_000_000))
+    });
+    sends.store(false, Ordering::Relaxed);
+    sender.join().expect("no panic");
+    let reported = stop(running);
+    let ended = reported.iter().find(|event| event["event"] == "episode").expect("an episode");
+    let reasons: Vec<_> = ended["reasons"].as_array().expect("reasons").iter().filter_map(Value::as_str).collect();
+    for expected in ["phone: capture times uncertain by ±", " samples damaged (limit 1 %)"] {
+        assert!(reasons.iter().any(|reason| reason.contains(expected)), "{expected}: {reasons:#?}");
+    }
+    let inspected = place.run(&["inspect", "--json", &format!("out/{}", place.files("out")[0])]);
+    let inspected: Value = serde_json::from_slice(&inspected.stdout).expect("JSON");
+    assert_eq!(inspected["reasons"], ended["reasons"], "the recorder and a reader of the file agree");
+    let quality = &inspected["modalities"][0]["quality"];
+    assert_eq!(quality["damaged"], 1, "{quality}");
+    assert!(quality["clock_uncertainty"].as_f64() > Some(150.0), "{quality}");
+}
+
 #[test]
 fn a_phone_connects_and_sends_pictures_with_poses() {
     for stream in ["image", "pose"] {
         let (place, [port, probe]) = (Place::new(), free_ports());
-        let entry = format!(
-            "{RIG}[device.phone]\nnode = \"lan\"\nbit = 0\n[device.phone.lan]\nprotocol = \"iphone\"\n\
-             host = \"127.0.0.1\"\nport = {port}\nprobe_port = {probe}\nstream = {stream:?}\n\
-             width = {WIDTH}\nheight = {HEIGHT}\n"
-        );
-        place.write("devices.toml", &entry);
+        place.write("devices.toml", &phone_entry(port, probe, stream));
         let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
         let listener = Server::start(probe, drop);
         let sends = Arc::new(AtomicBool::new(true));
         let sender = std::thread::spawn({
             let sends = Arc::clone(&sends);
-            move || phone(port, &sends)
+            move || phone(port, &sends, |_| 0.0)
         });
         wait_for(&running, "phone", "streaming", 1);
         sends.store(false, Ordering::Relaxed);

@@ -102,7 +102,7 @@ fn a_sensor_of_another_computer_comes_goes_and_is_recorded_with_its_clock() {
     assert!(recorded[0].json.contains("\"uncertainty_ns\":40000000"), "{}", recorded[0].json);
 
     // The recorder and a reader of the file agree.
-    let reason = "cam: the clock of its computer was known to 40 ms only (limit 12 ms)";
+    let reason = "cam: capture times uncertain by ±40 ms (limit 12 ms)";
     let ended = reported.iter().find(|event| event["event"] == "episode").expect("an episode");
     assert!(ended["reasons"].as_array().expect("reasons").contains(&reason.into()), "{ended}");
     let inspected = place.run(&["inspect", "--json", &format!("out/{}", files[0])]);

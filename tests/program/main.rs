@@ -21,6 +21,8 @@ mod ends;
 mod export;
 #[cfg(feature = "foxglove")]
 mod foxglove;
+#[cfg(feature = "foxglove")]
+mod foxglove_hostile;
 mod hooks;
 mod hostile;
 mod infer;
@@ -50,6 +52,7 @@ mod screen;
 mod scripts;
 mod second_run;
 mod session;
+mod sessions;
 mod shared_memory;
 mod skips;
 mod stops;

@@ -113,6 +113,20 @@ fn a_data_set_has_the_other_stream_alone() {
     };
     run(&["--sim", "--headless", "--record", "--out", "out", "--duration", "2s"]);
     run(&["export", "out", "--to", "lerobot", "--out", "set", "--verify", "--include-bad"]);
+    // What the dataset lacks is named.
+    let words = ["export", "out", "--to", "lerobot", "--include-bad", "--out"];
+    let text = place.run(&[&words[..], &["text"]].concat()).stdout;
+    let text = String::from_utf8(text).expect("text");
+    let depth = "not in the dataset: d435_depth of 1 episode: depth, for which LeRobot has no feature\n";
+    assert!(text.contains(depth), "{text}");
+    let text = place.run(&[&words[..], &["objects", "--json"]].concat()).stdout;
+    let text = String::from_utf8(text).expect("text");
+    let summary: Value = serde_json::from_str(text.lines().last().expect("a line")).expect("JSON");
+    let lacking = summary["not_exported"].as_array().expect("a list");
+    let names: Vec<&str> = lacking.iter().map(|what| what["name"].as_str().expect("a name")).collect();
+    // A line of the log is not in every episode.
+    let names: Vec<&str> = names.into_iter().filter(|name| *name != "/rapid/log").collect();
+    assert_eq!(names, ["/rapid/event", "d435_depth"], "{summary}");
     let info: Value =
         serde_json::from_slice(&std::fs::read(place.path("set/meta/info.json")).expect("a file")).expect("JSON");
     let features = info["features"].as_object().expect("features");

@@ -350,6 +350,84 @@ fn without_the_token_there_is_nothing_but_the_page() {
     assert!(String::from_utf8_lossy(&refused.stderr).contains("chmod 600 page.token"));
 }
 
+/// A client that has shown this token.
+fn entered(client: &Client, token: &str) -> Client {
+    let entered = client.request("POST /enter", token);
+    let cookie = entered.header("set-cookie").expect("a cookie").split(';').next().expect("a pair").to_owned();
+    client.with(&format!("{}Cookie: {cookie}\r\n", client.headers))
+}
+
+#[test]
+fn those_without_the_token_keep_the_operator_neither_out_nor_from_the_page() {
+    let place = Place::lenient();
+    let running = start(&place, &["--web-token", "page.token"]);
+    let (_, token) = link(&running);
+    let client = Client::of(&running);
+    // They say nothing, begin a request, or ask again and again.
+    let strangers = |count: usize| -> Vec<_> {
+        let stranger = |number: usize| {
+            let mut stream = client.connect();
+            let said: &[u8] =
+                [&b""[..], b"GET /events HT", b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n"][number % 3];
+            // It may have given way already.
+            let _ = stream.write_all(said);
+            stream
+        };
+        (0..count).map(stranger).collect()
+    };
+    let before = strangers(64);
+    let operator = entered(&client, &token);
+    let mut page = operator.events();
+    page.until("the page is shown", |view| view["phase"].is_string());
+    let after = strangers(64);
+    operator.done(&json!({ "do": "start" }));
+    page.until("the page continues", |view| view["phase"] == "recording");
+    operator.done(&json!({ "do": "stop" }));
+    drop((before, after));
+    end(running);
+}
+
+#[test]
+fn a_removed_token_locks_out_at_once_and_a_new_one_lets_in() {
+    let place = Place::lenient();
+    let running = start(&place, &["--web-token", "page.token"]);
+    let (_, first) = link(&running);
+    let client = Client::of(&running);
+    let phone = entered(&client, &first);
+    let page = phone.events();
+    phone.done(&json!({ "do": "start" }));
+    std::fs::remove_file(place.path("page.token")).expect("it is removed");
+    let refused = |client: &Client| {
+        for line in ["GET /events", "GET /picture/0", "POST /do"] {
+            assert_eq!(client.request(line, r#"{"do":"stop"}"#).status, 401, "{line}");
+        }
+        assert_eq!(client.request("POST /enter", &first).status, 401);
+    };
+    refused(&phone);
+    // The stream that was open ends.
+    let mut rest = Vec::new();
+    let mut stream = page.stream;
+    stream.read_to_end(&mut rest).expect("its end");
+    // Another token takes its place, with which a phone enters again.
+    let kept = || std::fs::read_to_string(place.path("page.token")).unwrap_or_default().trim_end().to_owned();
+    until("there is a new token", || kept().len() == 22);
+    let second = kept();
+    assert_ne!(first, second);
+    let phone_again = entered(&client, &second);
+    phone_again.events().until("it is shown", |view| view["phase"] == "recording");
+    refused(&phone);
+    // So does one that the user writes.
+    let third = "A".repeat(30);
+    std::fs::write(place.path("page.token"), &third).expect("it is written");
+    refused(&phone_again);
+    entered(&client, &third).done(&json!({ "do": "stop" }));
+    until("the log says so", || {
+        let log = String::from_utf8_lossy(&place.run(&["logs"]).stdout).into_owned();
+        log.matches("the file of --web-token has another token").count() >= 2 && !log.contains(&second)
+    });
+    end(running);
+}
+
 #[test]
 fn an_address_of_the_network_needs_a_token_that_is_new_each_time() {
     let place = Place::new();
@@ -400,11 +478,15 @@ fn clients_that_stick_send_garbage_or_are_many_cost_the_recording_nothing() {
         let _ = stream.read_to_end(&mut rest);
         assert!(!String::from_utf8_lossy(&rest).starts_with("HTTP/1.1 2"), "{garbage:.20?}");
     }
-    let many: Vec<_> = (0..50).map(|_| client.connect()).collect();
-    // The last of them find no place, and hear so.
-    let mut refused = String::new();
-    (&many[49]).read_to_string(&mut refused).expect("an answer");
-    assert!(refused.starts_with("HTTP/1.1 503"), "{refused}");
+    // Who comes when pages have all places finds none, and hears so.
+    let mut many = Vec::new();
+    until("a connection is refused", || {
+        many.push(client.send("GET /events", ""));
+        let mut stream = client.connect();
+        stream.set_read_timeout(Some(Duration::from_millis(100))).expect("a timeout");
+        let mut answer = [0; 12];
+        stream.read_exact(&mut answer).is_ok() && answer == *b"HTTP/1.1 503"
+    });
     // The page that was there continues.
     page.until("a second later", |view| view["recording"]["time"].as_str() > Some("00:02"));
     // Those that say nothing are left, whoever they are.

@@ -197,10 +197,11 @@ impl Place {
         std::fs::read_to_string(folder.join(format!("{device}.log"))).unwrap_or_default()
     }
 
-    /// Files in `folder` of this place but those of a session, by name: the monitor keeps a session.
+    /// Files in `folder` of this place but those of a session, by name: the monitor keeps a session, and a file for what is
+    /// noted about an episode.
     pub(crate) fn episodes(&self, folder: &str) -> Vec<String> {
         let mut names = self.files(folder);
-        names.retain(|name| !name.starts_with("session"));
+        names.retain(|name| !name.starts_with("session") && !name.ends_with(".mcap.toml"));
         names
     }
 

@@ -20,6 +20,8 @@ use super::*;
 use crate::patience::PATIENCE;
 use crate::session::journal::Plan;
 
+mod kept;
+
 /// A bus on which nothing is published.
 struct Quiet;
 
@@ -126,10 +128,10 @@ impl Bench {
         self.conductor.collection.close().await.unwrap();
     }
 
-    /// Files of episodes, finished or not.
+    /// Files of episodes, finished or not; not of what is noted about them.
     fn files(&self) -> Vec<String> {
         let mut names = self.names();
-        names.retain(|name| name.contains(".mcap"));
+        names.retain(|name| name.contains(".mcap") && !name.contains(".toml"));
         names
     }
 
@@ -350,7 +352,9 @@ async fn episodes_are_discarded_restored_labelled_and_the_session_ended_by_reque
     outcome.unwrap();
     bench.conductor.collection.close().await.unwrap();
     let names = bench.names();
-    assert_eq!(names.len(), 4, "{names:?}");
+    // With what was noted about the first.
+    assert_eq!(names.len(), 5, "{names:?}");
+    assert!(names[1].ends_with("_001.mcap.toml"), "{names:?}");
     assert!(names.iter().filter(|name| name.starts_with("session-")).count() == 2, "{names:?}");
 }
 

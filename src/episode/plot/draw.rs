@@ -6,7 +6,7 @@ mod rows;
 use std::fmt::Write;
 
 use rapid_core::text;
-use rapid_status::session::EpisodeEntry;
+use rapid_status::session::Notes;
 
 use super::gather::Timeline;
 use super::svg::{Anchor, Px, Svg};
@@ -40,7 +40,7 @@ text{font-family:system-ui,-apple-system,'Segoe UI',Roboto,'DejaVu Sans',sans-se
 ";
 
 /// The picture of a report, a timeline and what people noted.
-pub(super) fn draw(report: &Inspection, timeline: &Timeline, noted: Option<&EpisodeEntry>) -> String {
+pub(super) fn draw(report: &Inspection, timeline: &Timeline, noted: Option<&Notes>) -> String {
     let mut page = Svg::default();
     let mut y = head::draw(&mut page, report, noted);
     let marks = marks_height(timeline);

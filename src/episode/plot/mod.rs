@@ -15,7 +15,7 @@ mod thumbnail;
 
 use std::path::Path;
 
-use rapid_status::session::EpisodeEntry;
+use rapid_status::session::Notes;
 
 use crate::reader::Reader;
 use crate::record::inspect::{self, Inspection, Judgement, ReadError};
@@ -37,7 +37,7 @@ pub struct Plot {
 ///
 /// # Errors
 /// When it cannot be read or is not an MCAP file. An unfinished or damaged one is not an error.
-pub fn plot(path: &Path, noted: Option<&EpisodeEntry>) -> Result<Plot, ReadError> {
+pub fn plot(path: &Path, noted: Option<&Notes>) -> Result<Plot, ReadError> {
     let report = inspect::inspect(path)?;
     // A file of another program has no modalities: then its topics are drawn.
     let every_topic = report.modalities.is_empty() && report.verdict == Judgement::NotOurs;

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use proptest::prelude::*;
 use rapid_core::modality::ModalityId;
-use rapid_status::session::Label;
+use rapid_status::session::{Label, Notes};
 use rapid_status::{Grade, Verdict};
 use roxmltree::Document;
 
@@ -82,18 +82,11 @@ fn the_picture_is_bounded_and_escaped_whatever_is_in_the_file() {
     report.verdict = Judgement::Episode(Verdict { grade: Grade::Bad, reasons, sensors: None, replay_of: Vec::new() });
     report.modalities = (0..64).map(flapping).collect();
     report.mask = (0..10_000).map(|at| MaskEdge { at: f64::from(at) * 0.36, mask: HOSTILE.to_owned() }).collect();
-    let noted = EpisodeEntry {
-        file: "x.mcap".to_owned(),
-        begun: String::new(),
-        seconds: None,
-        verdict: None,
-        reasons: Vec::new(),
+    let noted = Notes {
         label: Some(Label::Failure),
         label_reason: HOSTILE.to_owned(),
         note: HOSTILE.repeat(1000),
-        discarded: false,
         marks: Vec::new(),
-        sensors: None,
     };
     for seconds in [3600.0, 0.0, 1e300, 4e-4] {
         report.seconds = seconds;

@@ -23,6 +23,7 @@ use rapid_core::time::{Stamp, WallClock};
 use rapid_core::topic::{EVENT_TOPIC, FRAME_TOPIC, LOG_TOPIC};
 use rapid_registry::{Form, ModuleSpec, Registry, TransformSpec};
 use rapid_status::Level;
+use rapid_system::disk::FileLimit;
 
 use super::tampering::FileWatch;
 use crate::chunk_writer::{self, ChunkWriter, Sink, io_error};
@@ -34,6 +35,9 @@ use crate::reference::{self, ReferenceSample};
 use crate::schema::{self, PROTOBUF, SampleSchema, Schema};
 use crate::{ABOUT, SUMMARY, channel};
 
+/// Bytes for the end of a file beside its index: frames and events of the last second, and the verdict.
+const FOR_END: u64 = 1 << 20;
+
 pub(super) struct EpisodeFile {
     /// Declared before the writer, which writes its own end when dropped.
     #[expect(dead_code, reason = "held to be dropped")]
@@ -41,6 +45,8 @@ pub(super) struct EpisodeFile {
     writer: ChunkWriter<Latch>,
     /// Bytes that the sink took.
     written: Arc<AtomicU64>,
+    /// How large it may become.
+    limit: FileLimit,
     /// Checks at every flush and at the end whether another program has damaged the file.
     tampering: FileWatch,
     /// Where what only it writes is shown.
@@ -166,6 +172,7 @@ impl EpisodeFile {
             shut,
             writer,
             written,
+            limit: FileLimit::NONE,
             tampering,
             shown,
             clock,
@@ -197,6 +204,20 @@ impl EpisodeFile {
             }
         }
         Ok(file)
+    }
+
+    /// The same, which may grow to `limit`.
+    pub(super) fn limited(self, limit: FileLimit) -> Self {
+        Self { limit, ..self }
+    }
+
+    /// Why `bytes` more of a sample, and then its end, do not fit into the file; `None` if they do.
+    pub(super) fn full(&self, bytes: usize) -> Option<FileLimit> {
+        let written = self.written.load(Ordering::Relaxed);
+        // A sample whose form is known is written twice.
+        let more = (bytes as u64).saturating_mul(2).saturating_add(FOR_END);
+        let needed = written.saturating_add(self.writer.outstanding()).saturating_add(more);
+        (needed > self.limit.bytes).then_some(self.limit)
     }
 
     /// Is this, byte for byte, the newest sample of the modality? Compared with the written message; a copy would cost

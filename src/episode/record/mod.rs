@@ -40,6 +40,7 @@ pub use recorder::{Recorder, RecorderAddition, RecorderConfig, Source};
 pub use space::Asker;
 
 use rapid_core::text;
+use rapid_system::disk::FileLimit;
 
 /// Why an episode cannot be recorded.
 #[derive(Debug, thiserror::Error)]
@@ -61,6 +62,17 @@ pub enum RecordError {
     /// The folder lies behind another user's link, or cannot be entered.
     #[error("{0}, or choose another with --out")]
     Folder(rapid_system::folder::FolderError),
+    /// The folder was moved while a session is collected in it.
+    #[error(
+        "{}: this folder was moved to {} during the session: move it back, or end this run and begin another with --out {}",
+        from.display(), to.display(), to.display()
+    )]
+    Moved {
+        /// Its path.
+        from: PathBuf,
+        /// Where it is now.
+        to: PathBuf,
+    },
     /// There is not enough disk space for an episode.
     #[error(
         "{}: the disk is full: {} free, and an episode needs more than {}, which are kept free (disk_reserve under \
@@ -74,6 +86,14 @@ pub enum RecordError {
         free: u64,
         /// Space to be left free, bytes.
         reserve: u64,
+    },
+    /// Files may not be as large as an episode becomes.
+    #[error("{}: too small for an episode: {limit}", folder.display())]
+    FileLimit {
+        /// The folder.
+        folder: PathBuf,
+        /// How large a file may become in it.
+        limit: FileLimit,
     },
     /// There is an episode in progress.
     #[error("already recording {}", .0.display())]

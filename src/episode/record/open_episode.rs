@@ -19,6 +19,7 @@
 //! Invariant: every sample a frame names was written to the file before the frame.
 
 use std::io;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -30,6 +31,7 @@ use rapid_core::time::{Stamp, WallClock};
 use rapid_pictures::judge::PictureJudge;
 use rapid_registry::{DeviceSpec, ModuleSpec, Registry};
 use rapid_status::{Board, EpisodeReport, Event, EventKind, Level, Outlook, RecordingStatus};
+use rapid_system::disk::{FileLimit, is_full};
 
 use super::announce::{Announced, announce_faults};
 use super::episode_path::{self, EpisodePath, EpisodeRequest};
@@ -40,6 +42,7 @@ use super::metadata::{self, Configuration, Ending};
 use super::provenance::{Attached, Units};
 use super::publishers::Publisher;
 use super::quality::{Frames, Measured, Measures, Quality, SampleFacts};
+use super::space::MAKE_ROOM;
 use super::tampering::FileWatch;
 use super::verdict::{Facts, FileState, Judged, Losses, Missing, findings, judge};
 use super::writeback::Writeback;
@@ -67,6 +70,8 @@ pub(super) struct Beginning<'a> {
     pub(super) request: &'a EpisodeRequest,
     pub(super) path: EpisodePath,
     pub(super) sink: Box<dyn Sink>,
+    /// How large the file may become.
+    pub(super) limit: FileLimit,
     pub(super) attached: &'a Attached,
     pub(super) clock: WallClock,
     pub(super) begin: Stamp,
@@ -115,12 +120,15 @@ pub(super) struct OpenEpisode {
     outlook: Outlook,
     /// The first error of the file: nothing is written after it.
     failed: Option<io::Error>,
+    /// The file has become as large as it may: it takes no more samples, and its end fits.
+    full: Option<FileLimit>,
 }
 
 impl OpenEpisode {
     /// Begins an episode and writes the file's initial records.
     pub(super) fn begin(beginning: Beginning<'_>, masks: &MaskHistory) -> io::Result<Self> {
-        let Beginning { registry, board, request, path, sink, attached, clock, begin, shown, references } = beginning;
+        let Beginning { registry, board, request, path, sink, limit, attached, clock, begin, shown, references } =
+            beginning;
         let units = Units::new(attached);
         let mask = masks.at(begin).map_or(PhysicalMask::default(), |(_, bits, _)| bits.mask);
         let configuration = Configuration::new(&registry, &request.modules, &request.tags, mask);
@@ -131,7 +139,7 @@ impl OpenEpisode {
         }
         let report = metadata::beginning(&registry, &request.task, &configuration, &units, clock, begin);
         let tampering = FileWatch::begin(&path);
-        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, report, tampering, shown)?;
+        let mut file = EpisodeFile::begin(sink, &registry, clock, begin, report, tampering, shown)?.limited(limit);
         let is_mounted = |module: &&ModuleSpec| configuration.modules.contains(&module.name);
         file.transforms(registry.modules.iter().filter(is_mounted), begin)?;
         let settle = SETTLE + registry.devices.iter().map(|device| device.latency).max().unwrap_or_default();
@@ -172,6 +180,7 @@ impl OpenEpisode {
             settle,
             outlook: Outlook::default(),
             failed: None,
+            full: None,
         })
     }
 
@@ -186,7 +195,7 @@ impl OpenEpisode {
             let (lost, dropped) = (self.share(&hole, hole.lost, latency), self.share(&hole, hole.dropped, latency));
             self.measures.missing(id, lost, dropped);
         }
-        if !self.holds(Stamp(header.capture_ns), latency) || self.failed.is_some() {
+        if !self.holds(Stamp(header.capture_ns), latency) || self.failed.is_some() || !self.has_room(header, payload) {
             return;
         }
         let repeated = Some(self.file.repeats(id, payload));
@@ -219,6 +228,17 @@ impl OpenEpisode {
             keep: (),
         };
         self.sync.push(id, sample);
+    }
+
+    /// Whether the sample fits into the file. The episode ends with the first that does not.
+    fn has_room(&mut self, header: &SampleHeader, payload: &[u8]) -> bool {
+        if self.full.is_none() {
+            self.full = self.file.full(payload.len());
+            if self.full.is_some() {
+                self.end_at(Stamp(header.capture_ns));
+            }
+        }
+        self.full.is_none()
     }
 
     /// Takes a publication of the mask, and the gap before it.
@@ -286,6 +306,7 @@ impl OpenEpisode {
         while self.failed.is_none() && self.next_tick < ticks && now >= self.deadline(self.next_tick).after(GRACE) {
             self.write_frame(masks);
         }
+        self.full = self.full.or_else(|| self.file.full(0));
         self.measures.settle();
         announce_faults(&mut self.announced, &self.measures, &self.registry, &self.board, now, false);
     }
@@ -298,7 +319,9 @@ impl OpenEpisode {
 
     /// Whether it is time to [`Self::finish`].
     pub(super) fn is_over(&self, now: Stamp) -> bool {
-        self.failed.is_some() || self.end.is_some_and(|end| now >= end.after(self.settle).after(GRACE))
+        self.failed.is_some()
+            || self.full.is_some()
+            || self.end.is_some_and(|end| now >= end.after(self.settle).after(GRACE))
     }
 
     /// Whether the end of the episode is fixed by now.
@@ -333,6 +356,12 @@ impl OpenEpisode {
         self.failed = self.failed.take().or(ended.err());
     }
 
+    /// Why the episode had to end, if its file is full.
+    fn cut_short(&self) -> Option<String> {
+        let folder = self.path.finished.parent().unwrap_or(Path::new("")).display();
+        self.full.map(|limit| format!("{folder}: the episode was closed before its file was too large: {limit}"))
+    }
+
     /// Writes the remaining frames, ends the file and gives it its name. `reason`: why the episode is not whole
     /// although its file may be; `publishers`: other programs that published on our topics.
     pub(super) fn finish(
@@ -343,6 +372,7 @@ impl OpenEpisode {
         publishers: &[Publisher],
     ) -> EpisodeReport {
         self.end_writeback();
+        let reason = reason.or_else(|| self.cut_short());
         let end = self.end.unwrap_or(now).min(now).max(self.begin);
         let ticks = self.grid.ticks_before(end);
         while self.failed.is_none() && self.next_tick < ticks {
@@ -390,10 +420,11 @@ impl OpenEpisode {
                 (file, reason, whole)
             }
             Err(error) => {
+                let fix = if is_full(&error) { format!("; {MAKE_ROOM}") } else { String::new() };
                 let error = error.to_string();
                 let verdict = judge(&Facts { file: FileState::Failed(&error), ..facts });
                 let file = episode_path::failed(&self.path, &error);
-                (file, Some(reason.into_iter().chain([error]).collect::<Vec<_>>().join("; ")), verdict)
+                (file, Some(reason.into_iter().chain([error + &fix]).collect::<Vec<_>>().join("; ")), verdict)
             }
         };
         let bytes = std::fs::metadata(&file).map_or(0, |metadata| metadata.len());

@@ -28,7 +28,7 @@ use rapid_core::time::{ClockWatch, Stamp, WallClock};
 use rapid_registry::Registry;
 use rapid_status::stops::{Reported, States};
 use rapid_status::{Board, Episode, EpisodeReport, EpisodeWatch, Event, EventKind, Level, RecordingStatus};
-use rapid_system::disk::Disk;
+use rapid_system::disk::{Disk, FileLimit};
 use rapid_system::fault;
 use tokio::sync::broadcast::{self, error::TryRecvError as EventError};
 use tokio::sync::{oneshot, watch};
@@ -115,6 +115,8 @@ pub struct RecorderConfig {
     pub sink: Opener,
     /// Returns the free space on the disk of an episode's file.
     pub disk: Asker,
+    /// Returns how large an episode's file may become.
+    pub limit: Box<dyn FnMut(&File) -> FileLimit + Send>,
     /// Reads the clocks.
     pub clock: Box<dyn FnMut() -> WallClock + Send>,
     /// Returns the start time of an episode requested now: now. Tests use it to send the samples of the beginning, so
@@ -135,6 +137,7 @@ impl RecorderConfig {
             board,
             sink: Box::new(|file| Box::new(file)),
             disk: Box::new(Disk::of_file),
+            limit: Box::new(FileLimit::of),
             clock: Box::new(WallClock::now),
             begin: Box::new(Stamp::now),
             shown: None,
@@ -488,13 +491,16 @@ impl Writer {
         // One descriptor for the names, the disk space and the writeback, another for the sink.
         let (watched, file) = (Arc::clone(&path.file), path.file.try_clone().map_err(failed)?);
         let reserve = self.config.registry.rig.disk_reserve;
-        let space = Space::begin(watched, &request.out, reserve, begin, &mut self.config.disk).map_err(refuse)?;
+        let limit = (self.config.limit)(&watched);
+        let space =
+            Space::begin(watched, limit, &request.out, reserve, begin, &mut self.config.disk).map_err(refuse)?;
         let beginning = Beginning {
             registry: Arc::clone(&self.config.registry),
             board: Arc::clone(&self.config.board),
             request,
             path,
             sink: (self.config.sink)(file),
+            limit,
             attached: &self.attached,
             clock,
             begin,
@@ -549,6 +555,7 @@ impl Writer {
                 let folder = open.name().parent().map(Path::to_owned).unwrap_or_default();
                 self.config.board.announce(EventKind::DiskLow { folder, free, seconds: left.as_secs() });
             }
+            Finding::FileLimit(text) => self.complain(Level::Warn, text),
             Finding::Removed => {
                 let file = open.name().display();
                 let text =

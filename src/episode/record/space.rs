@@ -1,7 +1,9 @@
 //! Disk space for the episode in progress.
 //!
 //! Guarded twice: an episode ends before less than the reserve is free, and the space needed to close it is allocated
-//! in advance after the end of the file, so that it can be closed even when another program takes the last byte.
+//! in advance after the end of the file, so that it can be closed even when another program takes the last byte, or the
+//! user has no more (a quota). That a file may not become larger is the third: [`FileLimit`] is known from the start, and
+//! the file itself stays below it.
 //!
 //! | free, above the reserve                     | then                                       |
 //! |---------------------------------------------|--------------------------------------------|
@@ -20,7 +22,7 @@ use std::time::Duration;
 
 use rapid_core::text;
 use rapid_core::time::Stamp;
-use rapid_system::disk::Disk;
+use rapid_system::disk::{Disk, FileLimit, is_full};
 use rustix::fs::{FallocateFlags, fallocate, fstat, ftruncate};
 use rustix::io::Errno;
 
@@ -43,6 +45,9 @@ const RATE_OVER: Duration = Duration::from_secs(10);
 const RATE_LEAST: Duration = Duration::from_secs(2);
 /// Longer times are not forecast.
 const LEFT_MOST: Duration = Duration::from_hours(100);
+
+/// What to do about a disk or a quota that is full.
+pub(super) const MAKE_ROOM: &str = "remove or move recordings, or choose another folder with --out";
 
 /// Reads the free space on the disk of a file; only tests replace the answer of the file system.
 pub type Asker = Box<dyn FnMut(&File) -> io::Result<Disk> + Send>;
@@ -76,6 +81,8 @@ pub(super) enum Finding {
     },
     /// The reason why the episode must be closed now.
     Spent(String),
+    /// The file will soon be as large as it may become; reported once an episode.
+    FileLimit(String),
     /// The file has no name any more; reported once.
     Removed,
 }
@@ -83,6 +90,9 @@ pub(super) enum Finding {
 /// The room of one episode.
 pub(super) struct Space {
     file: Arc<File>,
+    limit: FileLimit,
+    /// Sets space aside; only tests replace it.
+    allocate: fn(&File, u64, u64) -> Result<(), Errno>,
     folder: PathBuf,
     reserve: u64,
     /// How much is set aside ahead of the end of the file; none where the file system cannot.
@@ -94,26 +104,33 @@ pub(super) struct Space {
     sizes: VecDeque<(Stamp, u64)>,
     left: Option<Duration>,
     reported_low: bool,
+    reported_limit: bool,
     reported_removed: bool,
 }
 
 impl Space {
-    /// Begins to watch over `file`, which lies in `folder`, of a disk of which `reserve` stays free.
+    /// Begins to watch over `file`, which may grow to `limit` and lies in `folder`, of a disk of which `reserve` stays free.
     ///
     /// # Errors
     /// When there is no room for an episode.
     pub(super) fn begin(
         file: Arc<File>,
+        limit: FileLimit,
         folder: &Path,
         reserve: Option<u64>,
         now: Stamp,
         ask: &mut Asker,
     ) -> Result<Self, RecordError> {
+        if limit.bytes < ASIDE_LEAST {
+            return Err(RecordError::FileLimit { folder: folder.to_owned(), limit });
+        }
         // Without a known size the disk is used anyway.
         let disk = ask(&file).unwrap_or(Disk { free: u64::MAX, size: 0 });
         let reserve = disk.reserve(reserve);
         let mut space = Self {
             file,
+            limit,
+            allocate: |file, from, length| fallocate(file, FallocateFlags::KEEP_SIZE, from, length),
             folder: folder.to_owned(),
             reserve,
             aside: Some((reserve / 2).clamp(ASIDE_LEAST, ASIDE_MOST)),
@@ -123,6 +140,7 @@ impl Space {
             sizes: VecDeque::from([(now, 0)]),
             left: None,
             reported_low: false,
+            reported_limit: false,
             reported_removed: false,
         };
         let full = |free| RecordError::NoRoom { folder: folder.to_owned(), free, reserve };
@@ -146,8 +164,7 @@ impl Space {
         if let Err(error) = self.set_aside(size) {
             let folder = self.folder.display();
             return Some(Finding::Spent(format!(
-                "{folder}: {}, and the episode was closed with what had been set aside for that; remove or move \
-                 recordings, or choose another folder with --out",
+                "{folder}: {}, and the episode was closed with what had been set aside for that; {MAKE_ROOM}",
                 io::Error::from(error)
             )));
         }
@@ -170,7 +187,22 @@ impl Space {
                 Room::Low(_) | Room::Ample => {}
             }
         }
-        (stat.st_nlink == 0 && !std::mem::replace(&mut self.reported_removed, true)).then_some(Finding::Removed)
+        if stat.st_nlink == 0 && !std::mem::replace(&mut self.reported_removed, true) {
+            return Some(Finding::Removed);
+        }
+        self.near_limit(size, rate)
+    }
+
+    /// The report that the file will soon be as large as it may become.
+    fn near_limit(&mut self, size: u64, rate: f64) -> Option<Finding> {
+        let seconds = self.limit.bytes.saturating_sub(size) as f64 / rate.max(1.0);
+        let left = Duration::try_from_secs_f64(seconds).ok().filter(|left| *left < WARN_LEFT)?;
+        self.left = Some(self.left.map_or(left, |disk| disk.min(left)));
+        let is_new = !std::mem::replace(&mut self.reported_limit, true);
+        is_new.then(|| {
+            let (folder, seconds, limit) = (self.folder.display(), left.as_secs(), self.limit);
+            Finding::FileLimit(format!("{folder}: the episode will be closed in about {seconds} s: {limit}"))
+        })
     }
 
     /// Time left while the disk is nearly full.
@@ -191,8 +223,7 @@ impl Space {
 
     fn spent(&self, free: u64) -> String {
         format!(
-            "{}: the disk is nearly full, {} free: the episode was closed to keep {} free (disk_reserve); remove or \
-             move recordings, or choose another folder with --out",
+            "{}: the disk is nearly full, {} free: the episode was closed to keep {} free (disk_reserve); {MAKE_ROOM}",
             self.folder.display(),
             text::size(free),
             text::size(self.reserve)
@@ -205,12 +236,15 @@ impl Space {
         if self.allocated >= size.saturating_add(aside / 2) && self.allocated > 0 {
             return Ok(());
         }
-        let end = size.saturating_add(aside);
-        match fallocate(&self.file, FallocateFlags::KEEP_SIZE, self.allocated, end - self.allocated) {
+        let end = size.saturating_add(aside).min(self.limit.bytes);
+        if end <= self.allocated {
+            return Ok(());
+        }
+        match (self.allocate)(&self.file, self.allocated, end - self.allocated) {
             Ok(()) => self.allocated = end,
-            Err(full @ (Errno::NOSPC | Errno::DQUOT)) => return Err(full),
             // Tried again at the next look.
             Err(Errno::INTR) => {}
+            Err(full) if is_full(&full.into()) => return Err(full),
             Err(error) => {
                 tracing::debug!(%error, "nothing can be set aside on this file system");
                 self.aside = None;
@@ -288,7 +322,8 @@ mod tests {
         let file = Arc::new(tempfile::tempfile().unwrap());
         let mut ask: Asker = Box::new(Disk::of_file);
         let blocks = |file: &File| fstat(file).unwrap().st_blocks;
-        let space = Space::begin(Arc::clone(&file), Path::new("."), Some(0), Stamp(0), &mut ask).unwrap();
+        let space =
+            Space::begin(Arc::clone(&file), FileLimit::NONE, Path::new("."), Some(0), Stamp(0), &mut ask).unwrap();
         assert_eq!(fstat(&file).unwrap().st_size, 0);
         if space.aside.is_none() {
             // A file system that cannot: nothing to be given back.
@@ -297,6 +332,35 @@ mod tests {
         assert!(blocks(&file) * 512 >= i64::try_from(ASIDE_LEAST).unwrap());
         space.release();
         assert_eq!(blocks(&file), 0);
+    }
+
+    #[test]
+    fn an_episode_is_closed_when_there_is_no_room_for_its_user_or_in_its_file() {
+        for (error, is_full) in
+            [(Errno::NOSPC, true), (Errno::DQUOT, true), (Errno::FBIG, true), (Errno::OPNOTSUPP, false)]
+        {
+            let file = Arc::new(tempfile::tempfile().unwrap());
+            let mut ask: Asker = Box::new(Disk::of_file);
+            let (limit, out) = (FileLimit::NONE, Path::new("out"));
+            let mut space = Space::begin(Arc::clone(&file), limit, out, Some(0), Stamp(0), &mut ask).unwrap();
+            if space.aside.is_none() {
+                return;
+            }
+            space.allocate = match error {
+                Errno::NOSPC => |_, _, _| Err(Errno::NOSPC),
+                Errno::DQUOT => |_, _, _| Err(Errno::DQUOT),
+                Errno::FBIG => |_, _, _| Err(Errno::FBIG),
+                _ => |_, _, _| Err(Errno::OPNOTSUPP),
+            };
+            file.set_len(ASIDE_MOST).unwrap();
+            let found = space.check(Stamp(0).after(LOOK_EVERY), &mut ask);
+            let Some(Finding::Spent(why)) = found else {
+                assert!(!is_full, "{error}: {found:?}");
+                continue;
+            };
+            let is_explained = why.contains(&io::Error::from(error).to_string()) && why.contains("--out");
+            assert!(is_full && is_explained && why.starts_with("out: "), "{error}: {why}");
+        }
     }
 
     #[test]

@@ -10,6 +10,7 @@ use rapid_core::sample::SampleHeader;
 use rapid_core::time::{Stamp, WallClock};
 use rapid_registry::Registry;
 use rapid_status::{Board, EpisodeReport, Event};
+use rapid_system::disk::FileLimit;
 
 use super::RecordError;
 use super::episode_path::{EpisodePath, EpisodeRequest};
@@ -61,6 +62,7 @@ impl Stepped {
             registry: Arc::clone(&self.registry),
             board: Arc::clone(&self.board),
             request,
+            limit: FileLimit::of(&path.file),
             path,
             sink,
             attached: &self.attached,

@@ -72,6 +72,23 @@ impl Script {
         self.put((TopicId::Modality(id(bit)), header, payload));
     }
 
+    /// A sample of this size.
+    fn sized(&self, bit: u8, seq: u64, capture: u64, bytes: usize) {
+        let encoding = if bit == TOF { Encoding::F64 } else { Encoding::Grey };
+        let header = SampleHeader {
+            seq,
+            capture_ns: capture,
+            recv_ns: capture,
+            id: bit.into(),
+            epoch: 1,
+            encoding: encoding as u32,
+            width: 4,
+            height: 2,
+            ..SampleHeader::default()
+        };
+        self.put((TopicId::Modality(id(bit)), header, vec![0; bytes]));
+    }
+
     fn mask(&self, mask: u64, sequence: u64, capture: u64) {
         let payload = [mask, sequence].iter().flat_map(|v| v.to_le_bytes()).collect();
         let header = SampleHeader {

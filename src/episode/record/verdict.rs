@@ -292,7 +292,7 @@ fn clock(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {
 fn uncertain(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {
     let uncertainty = quality.clock_uncertainty? / 1e3;
     let (grade, limit) = longer(limits, |limits| limits.uncertain, uncertainty)?;
-    let text = format!("the clock of its computer was known to {} only (limit {limit})", seconds(uncertainty));
+    let text = format!("capture times uncertain by ±{} (limit {limit})", seconds(uncertainty));
     Some((grade, text))
 }
 

@@ -6,7 +6,10 @@ use std::io;
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 
+use rapid_system::folder::{Folder, Links, Missing};
+
 use super::super::partial::{PARTIAL, publish};
+use crate::notes;
 
 /// Names tried when others are taken.
 const ATTEMPTS: u32 = 100;
@@ -40,7 +43,21 @@ impl Names {
 
     /// Gives `file` the first of its [`Self::candidates`] that is free; returns it.
     pub(super) fn publish(&self, file: &Path) -> io::Result<PathBuf> {
-        first_free(file, self.candidates(), "no free name for the whole file")
+        let to = first_free(file, self.candidates(), "no free name for the whole file")?;
+        self.copy_notes(&to);
+        Ok(to)
+    }
+
+    /// What people noted about the episode is about the repaired one too.
+    fn copy_notes(&self, to: &Path) {
+        let folder = to.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let folder = match Folder::open(folder, Links::Own, Missing::Refused) {
+            Ok(folder) => folder,
+            Err(error) => return tracing::warn!(%error, "labels and notes are not copied"),
+        };
+        if let Err(error) = notes::copy(&folder, &self.base, to) {
+            tracing::warn!(file = %to.display(), %error, "labels and notes are not copied");
+        }
     }
 
     /// Names for the whole file, the best first. The finished name of a `.partial` can only be

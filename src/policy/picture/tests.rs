@@ -189,7 +189,10 @@ fn unsuitable_pictures_are_refused_with_their_reason() {
             picture(Encoding::Grey, [2, 3], &grey),
             "a picture of 3x2, where the policy takes 2x2: set the camera to that",
         ),
-        (picture(Encoding::Mjpeg, [2, 2], &whole), "damaged picture: 16x16 pixels in a sample of 2x2"),
+        (
+            picture(Encoding::Mjpeg, [2, 2], &whole),
+            "damaged picture: [16, 16] pixels across and down in a sample of [2, 2]",
+        ),
         (picture(Encoding::Mjpeg, [16, 16], &whole[..whole.len() / 2]), "damaged picture: "),
     ];
     for (picture, expected) in cases {

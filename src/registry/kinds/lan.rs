@@ -380,8 +380,8 @@ impl Kind for LanSpec {
         if matches!(self.protocol, LanProtocol::Gopro { .. }) {
             *limits = limits.of_a_recorder();
         }
-        if self.is_remote() {
-            *limits = limits.of_another_computer(sync_window);
+        if self.is_remote() || matches!(self.protocol, LanProtocol::Iphone { .. }) {
+            *limits = limits.of_another_clock(sync_window);
         }
     }
 

@@ -46,7 +46,7 @@ keys! {
         opening = TIME, usually "5 s, off";
         /// Change of the stamps against this machine's clock over the episode.
         clock = TIME, usually "10 ms, 100 ms";
-        /// How far the capture times of a device of another computer may be wrong.
+        /// How far the capture times of a device with a clock of its own, a phone or another computer, may be wrong.
         uncertain = TIME, usually "half of `sync_window`, off; others off";
         /// Time of the episode that a device which records by itself did not record; one that recorded nothing is always BAD.
         clip = TIME, usually "2 s, off of GoPros; others off";

@@ -131,9 +131,10 @@ impl VerdictSpec {
         self
     }
 
-    /// Also judges the clock of another computer: beyond half of `sync_window` a sample may belong to another frame.
+    /// Also judges how well the clock of another computer, or of a phone, is known: beyond half of `sync_window` a sample
+    /// may belong to another frame.
     #[must_use]
-    pub fn of_another_computer(mut self, sync_window: Duration) -> Self {
+    pub fn of_another_clock(mut self, sync_window: Duration) -> Self {
         self.suspect.uncertain = Some(sync_window / 2);
         self
     }

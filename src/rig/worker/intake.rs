@@ -2,10 +2,8 @@
 //!
 //! 1. Modality and epoch must be ours: a sample of an earlier process does not belong to this device.
 //! 2. The payload must be what the entry declares, or the sample is refused.
-//! 3. A capture time that cannot be one (in the future, older than [`OLDEST`], or before that of an earlier sample) makes
-//!    the sample damaged: nothing says when it was captured. Its stamp is an estimate, by the delay of the sample before
-//!    it, so that it has a place in a recording. Older means late or damaged, never better: up to [`OLDEST`] a sample
-//!    keeps its capture time, and the verdict counts it as late.
+//! 3. A capture time that cannot be one makes the sample damaged ([`rapid_core::capture`]). 0 means that the program does not
+//!    know.
 //! 4. A gap in `seq` is a loss; a counter that jumps or restarts is not. A number that is repeated shows that nothing is
 //!    counted: the sample is passed on, and is a duplicate.
 //!
@@ -14,14 +12,12 @@
 
 use std::time::Duration;
 
+use rapid_core::capture::{CaptureTimes, Captured};
 use rapid_core::modality::{ModalityId, ModalityKind};
 use rapid_core::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, FLAG_ERROR, FLAG_SAME_NUMBER, SampleHeader};
 use rapid_core::time::Stamp;
 use rapid_registry::ProcessSpec;
 
-/// A sample that claims to be older than this is not believed: no program takes that long, but a clock of another
-/// origin looks like this.
-const OLDEST: Duration = Duration::from_secs(10);
 /// A larger gap means that the counter was set.
 const LARGEST_HOLE: u64 = 1_000_000;
 
@@ -68,11 +64,7 @@ pub(super) struct Intake {
     epoch: u32,
     expected: Expected,
     last: Option<u64>,
-    /// The newest capture time that was believed, and how long that sample took.
-    believed: Stamp,
-    delay: Duration,
-    /// The newest stamp that was passed on.
-    newest: Stamp,
+    times: CaptureTimes,
     /// A complaint that has not been fetched, and whether one of its kind came before.
     complaint: Option<String>,
     has_refused: bool,
@@ -93,9 +85,7 @@ impl Intake {
             epoch: epoch.0,
             expected,
             last: None,
-            believed: Stamp::default(),
-            delay: Duration::ZERO,
-            newest: Stamp::default(),
+            times: CaptureTimes::default(),
             complaint: None,
             has_refused: false,
             has_doubted: false,
@@ -117,7 +107,7 @@ impl Intake {
         let (captured, mut flags) = self.time(header, now);
         if self.last == Some(header.seq) {
             flags |= FLAG_SAME_NUMBER;
-            if !std::mem::replace(&mut self.has_repeated, true) {
+            if self.complaint.is_none() && !std::mem::replace(&mut self.has_repeated, true) {
                 let seq = header.seq;
                 self.complaint = Some(format!(
                     "samples are duplicates, of seq {seq} again: a program must count its samples in seq"
@@ -132,35 +122,18 @@ impl Intake {
 
     /// When a sample was captured, and its flags.
     fn time(&mut self, header: &SampleHeader, now: Stamp) -> (Stamp, u32) {
-        let report = Stamp(header.capture_ns);
-        let mut flags = header.flags & (FLAG_ERROR | FLAG_DEVICE_TIME);
-        let doubt = match now.since(report) {
-            // The program does not know: the sample has the time of its arrival.
-            _ if report == Stamp::default() => None,
-            _ if report > now => Some(format!("{:?} in the future", report.since(now))),
-            age if age > OLDEST => Some(format!("{age:?} old")),
-            _ if report < self.believed => Some(format!("{:?} before the one before", self.believed.since(report))),
-            age => {
-                (self.believed, self.delay) = (report, age);
-                // An estimate before it may be later than it, by as much as the delay varies.
-                let after = self.newest.after(Duration::from_nanos(1)).min(now);
-                self.newest = if report < self.newest { after } else { report };
-                return (self.newest, flags);
-            }
-        };
-        flags &= !FLAG_DEVICE_TIME;
-        if let Some(doubt) = doubt {
-            flags |= FLAG_ERROR;
-            if !std::mem::replace(&mut self.has_doubted, true) {
-                self.complaint = Some(format!(
-                    "samples are damaged, by a capture time that is {doubt}: send CLOCK_MONOTONIC, or 0 if it is not known"
-                ));
-            }
-            self.newest = self.newest.max(now.before(self.delay));
-        } else {
-            self.newest = self.newest.max(now);
+        let flags = header.flags & (FLAG_ERROR | FLAG_DEVICE_TIME);
+        if header.capture_ns == 0 {
+            return (self.times.unknown(now), flags & !FLAG_DEVICE_TIME);
         }
-        (self.newest, flags)
+        let Captured { at, doubt } = self.times.judge(Stamp(header.capture_ns), Duration::ZERO, now);
+        let Some(doubt) = doubt else { return (at, flags) };
+        if !std::mem::replace(&mut self.has_doubted, true) {
+            self.complaint = Some(format!(
+                "samples are damaged, by a capture time that is {doubt}: send CLOCK_MONOTONIC, or 0 if it is not known"
+            ));
+        }
+        (at, FLAG_ERROR)
     }
 
     /// A complaint for the user, the first time it occurs.

@@ -6,7 +6,6 @@
 use std::io;
 use std::num::NonZeroU32;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::time::Duration;
 
 use nix::sys::socket::setsockopt;
 use nix::sys::socket::sockopt::RcvBufForce;
@@ -17,15 +16,12 @@ use socketcan::{CanSocket, Socket as _, SocketOptions as _};
 
 use super::netlink::{self, Ready};
 use super::outcome::{Arrival, LinkError, is_overflow};
-use crate::driver::datagram::{self, Datagram};
+use crate::driver::datagram::{self, Datagram, StampClock};
 
 /// Bytes of a classical frame (`struct can_frame`, linux/can.h): identifier, length, three that mean nothing, data.
 const FRAME: usize = 16;
 /// linux/can.h.
 const CAN_RAW: Protocol = Protocol::from_raw(NonZeroU32::MIN);
-/// A longer wait of a frame is impossible: the wall clock was set.
-const OLDEST: Duration = Duration::from_secs(10);
-
 /// A bound socket.
 #[derive(Debug)]
 pub struct Socket {
@@ -36,6 +32,7 @@ pub struct Socket {
     /// The kernel's count of frames lost to a full queue.
     dropped: u32,
     lost: u64,
+    clock: StampClock,
     description: String,
 }
 
@@ -55,7 +52,16 @@ impl Socket {
 
     fn new(socket: CanSocket, name: &str, ready: Ready, description: String) -> Self {
         let Ready { index, restarts } = ready;
-        Self { bound: socket, name: name.to_owned(), index, restarts, dropped: 0, lost: 0, description }
+        Self {
+            bound: socket,
+            name: name.to_owned(),
+            index,
+            restarts,
+            dropped: 0,
+            lost: 0,
+            clock: StampClock::new(WallClock::now(), Stamp::now()),
+            description,
+        }
     }
 
     pub(super) fn send(&mut self, frame: &CanFrame) -> Result<(), LinkError> {
@@ -79,7 +85,7 @@ impl Socket {
         };
         *frame = received;
         self.lost += datagram.newly_dropped(&mut self.dropped) + u64::from(is_overflow(frame));
-        Ok(Some(arrival(datagram.stamp_ns)))
+        Ok(Some(arrival(datagram.stamp_ns, &mut self.clock)))
     }
 
     /// Why the link has ended; `None` if it has not: try again.
@@ -159,11 +165,10 @@ fn receive(socket: &CanSocket) -> io::Result<Option<(CanFrame, Datagram)>> {
     Ok((datagram.length == FRAME && !datagram.is_cut).then(|| (from_bytes(bytes), datagram)))
 }
 
-/// Converts a stamp of the wall clock to the monotonic clock.
-fn arrival(wall_ns: Option<u64>) -> Arrival {
+/// When a frame arrived, by the kernel's stamp if it can be converted.
+fn arrival(wall_ns: Option<u64>, clock: &mut StampClock) -> Arrival {
     let now = Stamp::now();
-    let stamp = wall_ns.map(|wall_ns| WallClock::now().stamp(wall_ns).min(now));
-    match stamp.filter(|stamp| now.since(*stamp) < OLDEST) {
+    match wall_ns.and_then(|wall_ns| clock.convert(wall_ns, WallClock::now(), now)) {
         Some(at) => Arrival { at, from_kernel: true },
         None => Arrival { at: now, from_kernel: false },
     }

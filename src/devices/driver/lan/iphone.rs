@@ -5,34 +5,30 @@
 //! phone is lost. For `pose`, each sample is the 16 values. The phone makes one connection, so both at once are not
 //! available.
 //!
-//! A sample's time is the phone's own, converted to our clock by the smallest delay seen ([`Clock`]).
-//!
-//! A measurement at the phone's time `d` arrives here at `a`, after some delay. The least `a - d` of the last seconds
-//! is the difference of the clocks plus the shortest delay, which on a local network is a few milliseconds; a longer
-//! delay, of any length, is thus recognised as delay and does not shift the time. If the phone's clock goes backwards,
-//! or is further ahead than any delay explains, a new session has begun.
+//! A sample's time is the phone's own, converted to our clock ([`clock`]); one whose time cannot be right is damaged.
 //!
 //! Invariant: a stamp is never later than the arrival.
 //! Invariant: only the entry's phone is accepted; a new connection from it replaces the old one, which may be dead
 //! without a report.
 
+mod clock;
 pub(super) mod packet;
 
 use std::io::{self, Write as _};
-use std::time::Duration;
 
-use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
+use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME, FLAG_ERROR};
 use rapid_core::time::Stamp;
 use rapid_registry::{LanPicture, PhoneStream};
 use tokio::io::AsyncReadExt as _;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::Instant;
 
+use self::clock::{Captured, PhoneClock};
 use self::packet::{Cut, FRAME_HEAD, Frame, Packets};
 use super::address::DeviceAddress;
 use super::mjpeg::Mismatch;
 use super::{PATIENCE, jpeg};
-use crate::driver::{DriverError, Reading};
+use crate::driver::{ClockOffset, DriverError, Reading};
 
 /// Bytes read from the kernel at once.
 const INBOX: usize = 64 << 10;
@@ -54,6 +50,7 @@ pub(super) struct Phone {
     max_bytes: usize,
     output: Vec<u8>,
     mismatch: Mismatch,
+    clock: PhoneClock,
     lost: u64,
 }
 
@@ -66,7 +63,6 @@ struct Connection {
     taken: usize,
     filled: usize,
     arrived: Stamp,
-    clock: Clock,
     /// When the newest frame was complete, or the phone connected.
     newest: Instant,
 }
@@ -91,6 +87,7 @@ impl Phone {
             max_bytes,
             output: Vec::new(),
             mismatch: Mismatch::default(),
+            clock: PhoneClock::recall(name),
             lost: 0,
         })
     }
@@ -102,15 +99,12 @@ impl Phone {
             }
             self.receive().await?;
         };
-        let captured = match &mut self.connection {
-            Some(connection) => {
-                connection.newest = Instant::now();
-                connection.clock.stamp(frame.device_time, arrived)
-            }
-            None => arrived,
-        };
+        if let Some(connection) = &mut self.connection {
+            connection.newest = Instant::now();
+        }
+        let Captured { at: captured, is_damaged } = self.clock.captured(&frame, arrived);
         let picture = self.connection.as_ref().map_or(&[][..], |connection| connection.packets.payload());
-        let mut flags = FLAG_DEVICE_TIME;
+        let mut flags = if is_damaged { FLAG_ERROR } else { FLAG_DEVICE_TIME };
         self.output.clear();
         if self.stream == PhoneStream::Pose {
             self.output.extend(frame.pose.iter().flat_map(|value| f64::from(*value).to_le_bytes()));
@@ -129,6 +123,11 @@ impl Phone {
             height: self.picture.height,
             lost: std::mem::take(&mut self.lost),
         })
+    }
+
+    /// How the phone's clock is known, once it is.
+    pub(super) fn clock(&self) -> Option<ClockOffset> {
+        self.clock.offset()
     }
 
     /// Parses received bytes, up to the end of a frame.
@@ -201,6 +200,7 @@ impl Phone {
             return Ok(());
         }
         self.place.received();
+        self.clock.connected();
         let largest = match self.stream {
             PhoneStream::Image => self.max_bytes.saturating_sub(COMMENT),
             // The picture is discarded, but arrives before the pose.
@@ -213,10 +213,16 @@ impl Phone {
             taken: 0,
             filled: 0,
             arrived: Stamp::now(),
-            clock: Clock::default(),
             newest: Instant::now(),
         });
         Ok(())
+    }
+}
+
+/// The next connection is another driver's.
+impl Drop for Phone {
+    fn drop(&mut self) {
+        self.clock.keep(&self.name);
     }
 }
 
@@ -260,105 +266,5 @@ fn number(value: f64, output: &mut Vec<u8>) {
     };
 }
 
-/// The minimum is taken over this long, twice: clocks drift apart by at most some 50 us a second.
-const WINDOW: Duration = Duration::from_secs(5);
-/// A capture time this far ahead of what the shortest delay permits belongs to another clock: a new session began.
-const LEAP_NS: i128 = 1_000_000_000;
-
-#[derive(Debug, Default)]
-struct Clock {
-    /// The least differences of this window and of the previous one, ns.
-    now: Option<i128>,
-    before: Option<i128>,
-    since: Stamp,
-    /// The phone's newest time, ns.
-    newest: i128,
-}
-
-impl Clock {
-    /// The moment on our clock at which the phone's clock showed `device` s.
-    fn stamp(&mut self, device: f64, arrived: Stamp) -> Stamp {
-        // Beyond 100 years it is not a clock.
-        if !(0.0..3.2e9).contains(&device) {
-            return arrived;
-        }
-        #[expect(clippy::cast_possible_truncation, reason = "within the range just checked")]
-        let device = (device * 1e9) as i128;
-        let difference = i128::from(arrived.0) - device;
-        if device < self.newest || self.least().is_some_and(|least| difference < least - LEAP_NS) {
-            *self = Self::default();
-        }
-        self.newest = device;
-        if self.now.is_none() || arrived.since(self.since) >= WINDOW {
-            (self.before, self.now, self.since) = (self.now, None, arrived);
-        }
-        self.now = Some(self.now.map_or(difference, |now| now.min(difference)));
-        let least = self.least().unwrap_or(difference);
-        Stamp(u64::try_from(device + least).unwrap_or(arrived.0)).min(arrived)
-    }
-
-    fn least(&self) -> Option<i128> {
-        self.now.into_iter().chain(self.before).min()
-    }
-}
-
 #[cfg(test)]
 mod tests;
-
-#[cfg(test)]
-mod clock_tests {
-    use super::*;
-
-    /// Differences between stamp and true capture, for delays in ms at 30 frames a second.
-    fn errors(delays: &[u64], drift_ppm: i64) -> Vec<i64> {
-        let mut clock = Clock::default();
-        let errors = delays.iter().zip(1_u64..).map(|(delay, frame)| {
-            let captured = 1_000_000_000 + frame * 33_333_333;
-            let device = captured as f64 * (1.0 + drift_ppm as f64 / 1e6) / 1e9 + 77.0;
-            let stamp = clock.stamp(device, Stamp(captured + delay * 1_000_000));
-            stamp.0.cast_signed() - captured.cast_signed()
-        });
-        errors.collect()
-    }
-
-    #[test]
-    fn a_delayed_frame_keeps_its_capture_time() {
-        let late = errors(&[5, 5, 5, 40, 200, 5, 90], 0);
-        assert!(late.iter().all(|error| (error - 5_000_000).abs() < 1000), "{late:?}");
-        // The first frames are late: the estimate improves with the first frame that is not.
-        let first = errors(&[30, 5, 30], 0);
-        assert!(first[0] > 29_000_000 && first[2] < 5_100_000, "{first:?}");
-    }
-
-    #[test]
-    fn samples_after_a_stall_keep_their_age() {
-        // The network stalls for four seconds, and then delivers everything at once.
-        let stalled = (0..120).map(|frame| 4005 - frame * 1000 / 30);
-        let delays: Vec<u64> = [5; 60].into_iter().chain(stalled).chain([5; 30]).collect();
-        let errors = errors(&delays, 0);
-        let bounds = 4_900_000..40_000_000;
-        assert!(errors.iter().all(|error| bounds.contains(error)), "{errors:?}");
-    }
-
-    #[test]
-    fn a_clock_that_drifts_is_followed() {
-        let delays: Vec<u64> = (0..1800).map(|frame| 5 + (frame * 7) % 30).collect();
-        for ppm in [-100, 100] {
-            let errors = errors(&delays, ppm);
-            assert!(errors.iter().skip(30).all(|error| (3_500_000..8_000_000).contains(error)), "{ppm}: {errors:?}");
-        }
-    }
-
-    #[test]
-    fn any_device_time_is_survived_and_no_stamp_is_later_than_the_arrival() {
-        let mut clock = Clock::default();
-        for device in [f64::NAN, f64::INFINITY, -1.0, 1e300, 0.0, 12.0, 0.0, 3e9, 5.0] {
-            assert!(clock.stamp(device, Stamp(9_000_000_000)) <= Stamp(9_000_000_000), "{device}");
-        }
-        // A new session began: its first frame is stamped with its arrival.
-        clock.stamp(100.0, Stamp(10_000_000_000));
-        assert_eq!(clock.stamp(5.0, Stamp(11_000_000_000)), Stamp(11_000_000_000));
-        // Here too; its clock is far ahead.
-        assert_eq!(clock.stamp(500.0, Stamp(12_000_000_000)), Stamp(12_000_000_000));
-    }
-}

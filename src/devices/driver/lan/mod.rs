@@ -121,9 +121,13 @@ impl Lan {
         }
     }
 
-    /// The clock of the computer that the device is on, if that is another one.
+    /// The clock of the phone, or of the computer that the device is on, if that is another one.
     pub fn clock(&self) -> Option<ClockOffset> {
-        if let Protocol::Remote(remote) = &self.protocol { remote.clock() } else { None }
+        match &self.protocol {
+            Protocol::Remote(remote) => remote.clock(),
+            Protocol::Iphone(phone) => phone.clock(),
+            Protocol::Mjpeg(_) | Protocol::Udp(_) | Protocol::Gopro(_) => None,
+        }
     }
 
     /// What a camera that records by itself does; `Some` at the first call only.

@@ -1,15 +1,16 @@
 //! Sensors of another computer: `rapid-remote` on this one sends their samples, with capture times on this clock
 //! ([`rapid_core::remote`]).
 //!
-//! Invariant: a sample has the format that the entry states, and a capture time that can be one: the sender is another
-//! program.
+//! Invariant: a sample has the format that the entry states: the sender is another program. One whose capture time cannot be
+//! one is damaged.
 //! Invariant: the connection ends when the sensor is absent there; then, and after a lease without a frame, the device
 //! is gone.
 
 use std::time::Duration;
 
+use rapid_core::capture::{CaptureTimes, Captured};
 use rapid_core::remote::{FrameError, Frames, Head, Kind, request};
-use rapid_core::sample::{Encoding, FLAG_SAME_NUMBER};
+use rapid_core::sample::{Encoding, FLAG_ERROR, FLAG_SAME_NUMBER};
 use rapid_core::time::Stamp;
 use rapid_registry::{PixelFormat, RemoteSamples};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -21,9 +22,8 @@ use crate::driver::{ClockOffset, DriverError, Reading};
 
 /// More samples at once are not missing: their numbers began again.
 const MOST_MISSING: u64 = 1 << 20;
-/// A capture time further in the past, or in the future, is not believed.
-const OLDEST: Duration = Duration::from_mins(1);
-const FURTHEST: Duration = Duration::from_secs(1);
+/// A clock that is known worse is not known.
+const LEAST_KNOWN: Duration = Duration::from_secs(1);
 
 pub(super) struct Wanted<'a> {
     pub(super) host: &'a str,
@@ -46,6 +46,9 @@ pub(super) struct Remote {
     /// The number of the newest sample.
     newest: Option<u64>,
     clock: Option<ClockOffset>,
+    times: CaptureTimes,
+    /// That a capture time is not believed has been logged.
+    has_doubted: bool,
 }
 
 impl Remote {
@@ -71,6 +74,8 @@ impl Remote {
             received: Instant::now(),
             newest: None,
             clock: None,
+            times: CaptureTimes::default(),
+            has_doubted: false,
         };
         // Its first frame reports that it is present.
         remote.frame().await?;
@@ -90,25 +95,32 @@ impl Remote {
             }
         };
         self.check(&head, encoding)?;
-        let captured = Stamp(head.capture_ns);
-        let now = Stamp::now();
-        if captured.since(now) > FURTHEST || now.since(captured) > OLDEST {
-            return Err(self.server.place.lost("a sample has no capture time of this computer's clock"));
-        }
         let missing = self.newest.map_or(0, |newest| head.seq.saturating_sub(newest.saturating_add(1)));
         let again = if self.newest == Some(head.seq) { FLAG_SAME_NUMBER } else { 0 };
         self.newest = Some(head.seq);
         let Head { offset_ns, uncertainty_ns, .. } = head;
         self.clock = Some(ClockOffset { offset_ns, uncertainty_ns });
+        let (captured, flags) = self.time(&head);
         Ok(Reading {
             bytes: self.frames.payload(),
             encoding,
             captured,
-            flags: head.flags | again,
+            flags: flags | again,
             width: head.width,
             height: head.height,
             lost: if missing < MOST_MISSING { missing } else { 0 },
         })
+    }
+
+    /// When a sample was captured, and its flags.
+    fn time(&mut self, head: &Head) -> (Stamp, u32) {
+        let uncertainty = Duration::from_nanos(head.uncertainty_ns).min(LEAST_KNOWN);
+        let Captured { at, doubt } = self.times.judge(Stamp(head.capture_ns), uncertainty, Stamp::now());
+        let Some(doubt) = doubt else { return (at, head.flags) };
+        if !std::mem::replace(&mut self.has_doubted, true) {
+            tracing::warn!(device = self.name, "samples are damaged, by a capture time that is {doubt}");
+        }
+        (at, FLAG_ERROR)
     }
 
     /// The next frame that is not a refusal.

@@ -15,8 +15,8 @@ use std::time::Duration;
 
 use nix::sys::socket::sockopt::BindToDevice;
 use nix::sys::socket::{SockaddrStorage, setsockopt};
-use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME};
-use rapid_core::time::{Stamp, realtime_ns};
+use rapid_core::sample::{Encoding, FLAG_DEVICE_TIME, FLAG_ERROR};
+use rapid_core::time::{Stamp, WallClock};
 use rapid_registry::own_side;
 use rustix::net::{AddressFamily, SocketFlags, SocketType};
 use tokio::io::Interest;
@@ -25,13 +25,11 @@ use tokio::task::coop::consume_budget;
 use tokio::time::timeout;
 
 use super::address::{DeviceAddress, port_error};
-use crate::driver::datagram::{self, Datagram};
+use crate::driver::datagram::{self, Datagram, StampClock};
 use crate::driver::{DriverError, Reading};
 
 /// The interface is checked after this long without a packet.
 const ASK_AFTER: Duration = Duration::from_millis(500);
-/// If a packet seems to have waited longer than this, the wall clock was set meanwhile.
-const LONGEST_WAIT: Duration = Duration::from_secs(1);
 
 #[derive(Debug)]
 pub(super) struct Packets {
@@ -42,6 +40,7 @@ pub(super) struct Packets {
     /// Number of packets that the kernel has dropped so far.
     dropped: u32,
     lost: u64,
+    clock: StampClock,
     /// Time of the newest packet.
     last: Stamp,
 }
@@ -53,7 +52,16 @@ impl Packets {
         // SAFETY: the registered value owns the descriptor.
         let socket = unsafe { AsyncFd::register_with_interest(socket, Interest::READABLE) }
             .map_err(|error| DriverError::Retry(format!("port {port}: {}", io::Error::from(error))))?;
-        Ok(Self { socket, place, packet: vec![0; max_bytes], filled: 0, dropped: 0, lost: 0, last: Stamp::default() })
+        Ok(Self {
+            socket,
+            place,
+            packet: vec![0; max_bytes],
+            filled: 0,
+            dropped: 0,
+            lost: 0,
+            clock: StampClock::new(WallClock::now(), Stamp::now()),
+            last: Stamp::default(),
+        })
     }
 
     pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
@@ -110,18 +118,19 @@ impl Packets {
             return None;
         }
         self.filled = received.length;
-        let (stamp, flags) = stamp(received.stamp_ns, Stamp::now(), realtime_ns());
+        let (stamp, flags) = stamp(received.stamp_ns, &mut self.clock, WallClock::now(), Stamp::now());
         // The two clocks are read one after the other, with a varying delay.
         self.last = self.last.max(stamp);
         Some((self.last, flags))
     }
 }
 
-/// Converts the kernel's wall-clock time to our clock; the moment of arrival if the kernel's time cannot be right.
-fn stamp(kernel: Option<u64>, now: Stamp, wall: u64) -> (Stamp, u32) {
-    let waited = kernel.and_then(|kernel| wall.checked_sub(kernel)).map(Duration::from_nanos);
-    match waited.filter(|waited| *waited <= LONGEST_WAIT) {
-        Some(waited) => (now.before(waited), FLAG_DEVICE_TIME),
+/// When a packet was received, and its flags: the moment of arrival if the kernel does not say, and damaged if what it says
+/// cannot be right.
+fn stamp(kernel: Option<u64>, clock: &mut StampClock, wall: WallClock, now: Stamp) -> (Stamp, u32) {
+    match kernel.map(|kernel| clock.convert(kernel, wall, now)) {
+        Some(Some(at)) => (at, FLAG_DEVICE_TIME),
+        Some(None) => (now, FLAG_ERROR),
         None => (now, 0),
     }
 }
@@ -190,17 +199,30 @@ mod tests {
     }
 
     #[test]
-    fn the_kernels_time_is_converted_where_it_is_plausible() {
-        let (now, wall) = (Stamp(5_000_000_000), 1_700_000_000_000_000_000);
-        for (kernel, expected) in [
-            (Some(wall - 1_000), (Stamp(4_999_999_000), FLAG_DEVICE_TIME)),
-            (Some(wall), (now, FLAG_DEVICE_TIME)),
-            // The clock was set back, or far ahead, while the packet waited.
-            (Some(wall + 1), (now, 0)),
-            (Some(wall - 2_000_000_000), (now, 0)),
-            (None, (now, 0)),
+    fn a_packet_is_as_old_as_the_kernel_says() {
+        const S: u64 = 1_000_000_000;
+        let (now, wall) = (Stamp(5_000 * S), 1_700_000_000 * S);
+        let relation = |wall: u64| WallClock::with_offset(i128::from(wall) - i128::from(now.0));
+        let here = relation(wall);
+        for (kernel, before, expected) in [
+            (Some(wall - 1_000), here, (Stamp(now.0 - 1_000), FLAG_DEVICE_TIME)),
+            (Some(wall), here, (now, FLAG_DEVICE_TIME)),
+            // The clocks are read one after the other.
+            (Some(wall + 1), here, (now, FLAG_DEVICE_TIME)),
+            // `rapid` was stopped meanwhile.
+            (Some(wall - 2 * S), here, (Stamp(now.0 - 2 * S), FLAG_DEVICE_TIME)),
+            (Some(wall - 3_600 * S), here, (Stamp(now.0 - 3_600 * S), FLAG_DEVICE_TIME)),
+            // The clock was set, back by a minute, while the packet waited.
+            (Some(wall + 59 * S), relation(wall + 60 * S), (Stamp(now.0 - S), FLAG_DEVICE_TIME)),
+            // The kernel's time is of no clock that was known.
+            (Some(wall + 59 * S), relation(wall - 60 * S), (now, FLAG_ERROR)),
+            (None, here, (now, 0)),
         ] {
-            assert_eq!(stamp(kernel, now, wall), expected, "{kernel:?}");
+            assert_eq!(
+                stamp(kernel, &mut StampClock::new(before, Stamp::default()), here, now),
+                expected,
+                "{kernel:?}"
+            );
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use rapid_core::text;
 use rapid_core::time::rfc3339;
-use rapid_status::session::{EpisodeEntry, Label};
+use rapid_status::session::{Label, Notes};
 
 use super::{MARGIN, WIDTH};
 use crate::plot::svg::{Anchor, Px, Svg};
@@ -17,7 +17,7 @@ const COLUMNS: usize = 160;
 const NAME: usize = 84;
 
 /// Draws it from the top; returns where the rest begins.
-pub(super) fn draw(page: &mut Svg, report: &Inspection, noted: Option<&EpisodeEntry>) -> f64 {
+pub(super) fn draw(page: &mut Svg, report: &Inspection, noted: Option<&Notes>) -> f64 {
     let name = report.file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     page.text("title", MARGIN, 44.0, Anchor::Start, &text::cut(&text::plain(&name), NAME, "…"));
     let word = report.verdict.grade().map_or("no verdict", rapid_status::Grade::word);
@@ -78,7 +78,7 @@ fn facts(report: &Inspection) -> String {
     words.collect::<Vec<_>>().join("  ·  ")
 }
 
-fn notes(noted: &EpisodeEntry) -> String {
+fn notes(noted: &Notes) -> String {
     let label = noted.label.map(|label| match noted.label_reason.as_str() {
         "" => format!("label {}", Label::word(label)),
         reason => format!("label {}: {reason}", Label::word(label)),

@@ -4,13 +4,19 @@ use super::*;
 use crate::Failed;
 use crate::recover;
 
-/// A disk of few bytes.
-struct SmallDisk(File, usize);
+/// A disk of few bytes, and what it says when they are written.
+struct SmallDisk(File, usize, io::ErrorKind);
+
+impl SmallDisk {
+    fn new(file: File, bytes: usize) -> Self {
+        Self(file, bytes, io::ErrorKind::StorageFull)
+    }
+}
 
 impl Write for SmallDisk {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         if self.1 == 0 {
-            return Err(io::ErrorKind::StorageFull.into());
+            return Err(self.2.into());
         }
         let taken = self.0.write(&bytes[..bytes.len().min(self.1)])?;
         self.1 -= taken;
@@ -30,31 +36,34 @@ impl Sink for SmallDisk {
 
 #[tokio::test]
 async fn a_full_disk_ends_the_episode_and_not_the_recorder() {
-    let mut episodes = 0;
-    let mut bench = Bench::with_sink(move |file| {
-        episodes += 1;
-        if episodes == 1 { Box::new(SmallDisk(file, 100_000)) } else { Box::new(file) }
-    });
-    let mut events = bench.board.events();
-    let finished = bench.recorder.start(bench.request(None)).await.unwrap();
-    for seq in 0..4000 {
-        bench.sample(CAM, 1, seq, Stamp::now().0, 0);
+    for kind in [io::ErrorKind::StorageFull, io::ErrorKind::QuotaExceeded, io::ErrorKind::FileTooLarge] {
+        let mut episodes = 0;
+        let mut bench = Bench::with_sink(move |file| {
+            episodes += 1;
+            if episodes == 1 { Box::new(SmallDisk(file, 100_000, kind)) } else { Box::new(file) }
+        });
+        let mut events = bench.board.events();
+        let finished = bench.recorder.start(bench.request(None)).await.unwrap();
+        for seq in 0..4000 {
+            bench.sample(CAM, 1, seq, Stamp::now().0, 0);
+        }
+        let closed = bench.until_closed(&mut events).await;
+        let sentence = closed.describe().sentence;
+        let EventKind::Episode(EpisodeReport { file, bytes, error, .. }) = closed else { unreachable!() };
+        assert_eq!(file, finished.with_extension("mcap.partial"));
+        let why = io::Error::from(kind).to_string();
+        assert_eq!(bytes, 100_000 + Failed::mark(&why).len() as u64);
+        let error = error.unwrap();
+        assert!(error.contains(&why) && error.contains("remove or move recordings"), "{error}");
+        assert_eq!(sentence.matches("place-block_001.mcap.partial").count(), 1, "{sentence}");
+        assert!(!finished.exists() && bench.board.snapshot().recording.is_none());
+        // Its end is kept for whoever waits for it.
+        assert_eq!(bench.recorder.ended().await.unwrap().error.as_ref(), Some(&error));
+        // The next one goes well.
+        let second = bench.recorder.start(bench.request(None)).await.unwrap();
+        assert!(second.to_str().unwrap().ends_with("_002.mcap"));
+        assert_eq!(bench.recorder.stop().await.unwrap().error, None);
     }
-    let closed = bench.until_closed(&mut events).await;
-    let sentence = closed.describe().sentence;
-    let EventKind::Episode(EpisodeReport { file, bytes, error, .. }) = closed else { unreachable!() };
-    assert_eq!(file, finished.with_extension("mcap.partial"));
-    assert_eq!(bytes, 100_000 + Failed::mark("no storage space").len() as u64);
-    let error = error.unwrap();
-    assert!(error.contains("no storage space"), "{error}");
-    assert_eq!(sentence.matches("place-block_001.mcap.partial").count(), 1, "{sentence}");
-    assert!(!finished.exists() && bench.board.snapshot().recording.is_none());
-    // Its end is kept for whoever waits for it.
-    assert_eq!(bench.recorder.ended().await.unwrap().error.as_ref(), Some(&error));
-    // The next one goes well.
-    let second = bench.recorder.start(bench.request(None)).await.unwrap();
-    assert!(second.to_str().unwrap().ends_with("_002.mcap"));
-    assert_eq!(bench.recorder.stop().await.unwrap().error, None);
 }
 
 /// A disk that is full once and has room again.
@@ -82,7 +91,7 @@ impl Sink for Recovering {
 
 #[tokio::test]
 async fn nothing_is_written_after_a_failed_write() {
-    let mut bench = Bench::with_sink(|file| Box::new(Recovering(SmallDisk(file, 100_000))));
+    let mut bench = Bench::with_sink(|file| Box::new(Recovering(SmallDisk::new(file, 100_000))));
     let mut events = bench.board.events();
     bench.recorder.start(bench.request(None)).await.unwrap();
     for seq in 0..4000 {
@@ -209,7 +218,7 @@ async fn a_file_not_yet_on_the_disk_keeps_its_partial_name() {
 
 #[tokio::test]
 async fn a_disk_full_at_the_start_is_an_error_and_leaves_no_file() {
-    let mut bench = Bench::with_sink(|file| Box::new(SmallDisk(file, 0)));
+    let mut bench = Bench::with_sink(|file| Box::new(SmallDisk::new(file, 0)));
     let mut request = bench.request(None);
     // More than the buffer in front of the disk holds.
     request.task = "x".repeat(200_000);

@@ -32,6 +32,7 @@ fn open_of(
     )
     .unwrap();
     let beginning = Beginning {
+        limit: FileLimit::NONE,
         registry: Arc::new(registry),
         board: Arc::clone(board),
         request: &EpisodeRequest::default(),

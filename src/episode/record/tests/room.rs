@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
 
 use rapid_core::time::WallClock;
 use rapid_status::Event;
-use rapid_system::disk::Disk;
+use rapid_system::disk::{Disk, FileLimit, LimitedBy};
 
 use super::*;
 
@@ -225,4 +225,80 @@ async fn a_clock_step_is_an_event_and_times_never_decrease() {
 
 fn read_begin(file: &Path) -> u64 {
     read(file).metadata["rapid"]["begin_wall_ns"].parse().unwrap()
+}
+
+/// A file that cannot become larger than `1`.
+struct Limited(File, u64);
+
+impl Write for Limited {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let room = self.1 - self.0.metadata()?.len();
+        if room == 0 {
+            return Err(io::ErrorKind::FileTooLarge.into());
+        }
+        self.0.write(&bytes[..bytes.len().min(usize::try_from(room).unwrap())])
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.0.flush()
+    }
+}
+
+impl Sink for Limited {
+    fn sync(&mut self) -> io::Result<()> {
+        self.0.sync_all()
+    }
+}
+
+#[tokio::test]
+async fn an_episode_is_closed_before_its_file_is_too_large() {
+    const LIMIT: u64 = 5 << 20;
+    for by in [LimitedBy::FileSystem, LimitedBy::Process] {
+        // Large samples, and small ones with much about each.
+        for (bit, bytes) in [(RAW, 900_000), (TOF, 16)] {
+            let mut bench = Bench::with(|config| {
+                config.sink = Box::new(|file| Box::new(Limited(file, LIMIT)));
+                config.limit = Box::new(move |_| FileLimit { bytes: LIMIT, by });
+            });
+            let mut events = bench.board.events();
+            let finished = bench.recorder.start(bench.request(None)).await.unwrap();
+            let mut seq = 0;
+            let closed = loop {
+                for _ in 0..50 {
+                    bench.script.sized(bit, seq, Stamp::now().0, bytes);
+                    seq += 1;
+                }
+                bench.script.taken().await;
+                match events.try_recv() {
+                    Ok(event) if matches!(event.what, EventKind::Episode(_)) => break event.what,
+                    _ => {}
+                }
+            };
+            let EventKind::Episode(EpisodeReport { file, error, verdict, .. }) = closed else { unreachable!() };
+            assert_eq!(file, finished, "{error:?}");
+            let error = error.unwrap();
+            let how = if by == LimitedBy::Process { "ulimit -f" } else { "ext4" };
+            assert!(error.contains("/out: ") && error.contains("5.2 MB") && error.contains(how), "{error}");
+            assert!(verdict.grade > Grade::Good && verdict.why().contains(&error), "{verdict:?}");
+            let size = std::fs::metadata(&file).unwrap().len();
+            assert!((LIMIT / 2..LIMIT).contains(&size), "{size}");
+            let read = read(&file);
+            assert_eq!(read.metadata["rapid/summary"]["cut_short"], error);
+            let topic = if bit == RAW { "/rapid/raw" } else { "/rapid/tof" };
+            assert!(read.on(topic).count() > 1);
+            // The next one is another file.
+            bench.recorder.ended().await.unwrap();
+            bench.recorder.start(bench.request(None)).await.unwrap();
+            assert_eq!(bench.recorder.stop().await.unwrap().error, None);
+        }
+    }
+}
+
+#[tokio::test]
+async fn where_files_are_too_small_for_an_episode_none_begins() {
+    let mut bench =
+        Bench::with(|config| config.limit = Box::new(|_| FileLimit { bytes: 1 << 20, by: LimitedBy::Process }));
+    let error = bench.recorder.start(bench.request(None)).await.unwrap_err().to_string();
+    assert!(error.contains("/out: too small for an episode: files are limited to 1.0 MB; raise"), "{error}");
+    assert_eq!(std::fs::read_dir(bench.folder.path().join("out")).unwrap().count(), 0);
 }

@@ -124,15 +124,15 @@ fn every_check_has_its_text_and_its_two_limits() {
     );
     is(|q| q.clock_drift = Some(150.0), Bad, &["cam: its clock fell behind this machine's by 150 ms (limit 100 ms)"]);
     is(|q| q.clock_ahead = 12.0, Suspect, &["cam: captured up to 12 ms after it was received (limit 10 ms)"]);
-    // Only the clock of another computer is judged.
+    // Only the clock of a phone or of another computer is judged.
     is(|q| q.clock_uncertainty = Some(1e6), Good, &[]);
-    let far = limits().of_another_computer(Duration::from_millis(25));
+    let far = limits().of_another_clock(Duration::from_millis(25));
     let judged = |ms| {
         let quality = Quality { clock_uncertainty: Some(ms), ..good() };
         uncertain(&quality, &far)
     };
     assert_eq!(judged(12.5), None);
-    let text = "the clock of its computer was known to 13 ms only (limit 12 ms)";
+    let text = "capture times uncertain by ±13 ms (limit 12 ms)";
     assert_eq!(judged(12.6), Some((Suspect, text.to_owned())));
     is(|q| q.hz = Some(15.04), Suspect, &["cam: 15.0 samples a second while present, of 30 (limit 90 %)"]);
     is(|q| q.hz = Some(14.9), Bad, &["cam: 14.9 samples a second while present, of 30 (limit 50 %)"]);

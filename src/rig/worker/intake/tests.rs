@@ -152,7 +152,9 @@ fn a_capture_time_that_is_not_believed_is_named_with_the_fix() {
         let mut intake = intake(ModalityKind::Bytes, &[]);
         // Each has another number.
         let mut judge = |capture_ns| {
-            intake.judge(&SampleHeader { seq: capture_ns, capture_ns, ..header(Encoding::Bytes) }, b"", NOW).expect("a sample");
+            intake
+                .judge(&SampleHeader { seq: capture_ns, capture_ns, ..header(Encoding::Bytes) }, b"", NOW)
+                .expect("a sample");
             intake.complaint()
         };
         assert_eq!(judge(NOW.0 - 5_000_000), None);

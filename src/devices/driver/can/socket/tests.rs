@@ -3,6 +3,7 @@
 
 use std::net::UdpSocket;
 use std::os::fd::OwnedFd;
+use std::time::Duration;
 
 use super::*;
 use crate::driver::can::link::Link;
@@ -71,12 +72,25 @@ fn the_kernels_stamp_is_put_on_the_monotonic_clock() {
 }
 
 #[test]
-fn a_stamp_from_before_the_clock_was_set_is_ignored() {
-    let wall = WallClock::now().wall_ns(Stamp::now());
-    assert!(arrival(Some(wall)).from_kernel);
-    assert!(!arrival(Some(wall - 3_600_000_000_000)).from_kernel);
-    assert!(arrival(Some(wall + 3_600_000_000_000)).at <= Stamp::now());
-    assert!(!arrival(None).from_kernel);
+fn a_frame_is_as_old_as_its_stamp_also_across_a_set_clock() {
+    const HOUR_NS: u64 = 3_600_000_000_000;
+    let (now, wall) = (Stamp::now(), WallClock::now());
+    let set_back = WallClock::with_offset(i128::from(wall.wall_ns(now)) + i128::from(HOUR_NS) - i128::from(now.0));
+    // The stamp, the relation of the clocks before, the age, and whether it is the kernel's.
+    let table = [
+        (Some(wall.wall_ns(now)), wall, 0, true),
+        (Some(wall.wall_ns(now) - 12_000_000_000), wall, 12, true),
+        (Some(wall.wall_ns(now) + HOUR_NS - 2_000_000_000), set_back, 2, true),
+        (Some(wall.wall_ns(now) + 2 * HOUR_NS), set_back, 0, false),
+        (None, wall, 0, false),
+    ];
+    for (stamp, before, age, from_kernel) in table {
+        let found = arrival(stamp, &mut StampClock::new(before, Stamp::default()));
+        assert_eq!(found.from_kernel, from_kernel, "{stamp:?}");
+        let latest = Stamp::now();
+        let is_of_the_age = now.since(found.at).as_secs().abs_diff(age) <= 1 && found.at <= latest;
+        assert!(is_of_the_age || !from_kernel && found.at >= now, "{stamp:?}: {found:?} {now:?}");
+    }
 }
 
 #[test]

@@ -75,7 +75,7 @@ async fn samples_come_with_their_clock_and_what_is_missing_is_counted() {
         match remote.read().await {
             Ok(reading) => {
                 assert_eq!((reading.encoding, reading.width, reading.bytes.len()), (Encoding::Grey, 4, 8));
-                assert!(Stamp::now().since(reading.captured) < FURTHEST);
+                assert_eq!(reading.flags, 0);
                 lost.push(reading.lost);
             }
             Err(error) => break error,
@@ -122,14 +122,47 @@ async fn what_does_not_fit_the_entry_is_named_with_its_fix() {
     let foreign =
         ends(PICTURES, vec![b"HTTP/1.1 400 Bad Request\r\n\r\n and what a server may send then".to_vec(); 2]).await;
     assert!(foreign.contains("not a frame of rapid-remote"), "{foreign}");
-    let head = |capture_ns| {
-        let encoding = Some(Grey);
-        Head { kind: Kind::Sample, encoding, capture_ns, width: 4, height: 2, ..Head::default() }.bytes().to_vec()
-    };
-    for capture_ns in [u64::MAX, Stamp::now().after(2 * FURTHEST).0] {
-        let error = ends(PICTURES, vec![head(capture_ns)]).await;
-        assert!(error.contains("no capture time"), "{error}");
+}
+
+#[tokio::test]
+async fn an_impossible_capture_time_decides_for_one_sample() {
+    const S: i64 = 1_000_000_000;
+    // How long ago each was captured, and whether that is believed.
+    let table = [
+        (S, true),
+        (S, true),
+        (3600 * S, false),
+        (11 * S, false),
+        (-2 * S, false),
+        (i64::MIN, false),
+        (5 * S, false),
+        (S, true),
+        (S / 2, true),
+    ];
+    let sent = table.iter().zip(0..).map(|((age, _), seq)| {
+        let capture_ns = Stamp::now().0.saturating_sub_signed(*age);
+        let head = Head {
+            kind: Kind::Sample,
+            encoding: Some(Encoding::Grey),
+            length: 8,
+            seq,
+            capture_ns,
+            width: 4,
+            height: 2,
+            ..Head::default()
+        };
+        [&head.bytes()[..], &[0; 8]].concat()
+    });
+    let mut remote = open(PICTURES, [vec![alive()], sent.collect()].concat(), LEASE, false).await.expect("present");
+    let mut newest = Stamp::default();
+    for (age, is_believed) in table {
+        let Reading { captured, flags, .. } = remote.read().await.expect("a sample");
+        assert_eq!(flags == 0, is_believed, "{age}");
+        assert!(captured >= newest && captured <= Stamp::now(), "{age}");
+        newest = captured;
     }
+    let ended = remote.read().await.map(|_| ());
+    assert!(matches!(ended, Err(DriverError::Gone)), "{ended:?}");
 }
 
 #[tokio::test]
