@@ -16,7 +16,7 @@
 //!
 //! Options: `--rate HZ`, `--channels N`; and to try what happens when a program misbehaves:
 //! `--ignore-sigterm`, `--crash-after SAMPLES`, `--silent-after SAMPLES`, `--flood-stderr`, `--behind SECONDS` (its capture
-//! times are that old; negative: in the future).
+//! times are that old; negative: in the future), `--same-number` (it does not count).
 
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "what a program prints goes to the log of `rapid`")]
 
@@ -90,8 +90,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         values[0] = f64::from(seq);
         let payload: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
         let mut sample = publisher.loan_slice_uninit(payload.len())?;
-        *sample.user_header_mut() =
-            Header(SampleHeader { seq: seq.into(), capture_ns: options.captured().0, ..header });
+        let number = if options.same_number { 7 } else { seq.into() };
+        *sample.user_header_mut() = Header(SampleHeader { seq: number, capture_ns: options.captured().0, ..header });
         sample.write_from_slice(&payload).send()?;
         wake.notify()?;
         let due = begun + Duration::from_secs_f64(f64::from(seq + 1) / options.rate);
@@ -112,6 +112,7 @@ struct Options {
     silent_after: Option<u32>,
     flood_stderr: bool,
     behind: f64,
+    same_number: bool,
 }
 
 impl Options {
@@ -124,6 +125,7 @@ impl Options {
             silent_after: None,
             flood_stderr: false,
             behind: 0.0,
+            same_number: false,
         };
         let mut arguments = std::env::args().skip(1);
         while let Some(option) = arguments.next() {
@@ -134,6 +136,7 @@ impl Options {
                 "--ignore-sigterm" => options.ignore_sigterm = true,
                 "--crash-after" => options.crash_after = Some(value(&option, arguments.next())?),
                 "--silent-after" => options.silent_after = Some(value(&option, arguments.next())?),
+                "--same-number" => options.same_number = true,
                 "--flood-stderr" => options.flood_stderr = true,
                 other => return Err(format!("unknown option {other}").into()),
             }

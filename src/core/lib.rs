@@ -9,6 +9,7 @@
 pub mod action;
 pub mod bell;
 pub mod capture;
+pub mod clip;
 pub mod interlock;
 pub mod mask;
 pub mod modality;

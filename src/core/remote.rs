@@ -24,7 +24,7 @@
 //! Invariant: no bytes make the reader panic, or keep more than the largest permitted payload.
 //! Invariant: a reader that is interrupted between two reads continues with the same frame.
 
-use crate::sample::{Encoding, FLAG_DEVICE_TIME, FLAG_ERROR};
+use crate::sample::{Encoding, FLAG_DEVICE_TIME, FLAG_ERROR, FLAG_SAME_NUMBER};
 
 /// Port of `rapid-remote` on this computer.
 pub const PORT: u16 = 7448;
@@ -171,7 +171,7 @@ impl Head {
             Kind::Sample if bytes_long > most => return Err(FrameError::TooLong { length, most }),
             _ => {}
         }
-        if flags & !(FLAG_ERROR | FLAG_DEVICE_TIME) != 0 {
+        if flags & !(FLAG_ERROR | FLAG_DEVICE_TIME | FLAG_SAME_NUMBER) != 0 {
             return Err(FrameError::Field("flags", flags.into()));
         }
         Ok(Self {

@@ -74,6 +74,9 @@ impl Encoding {
 pub const FLAG_ERROR: u32 = 1;
 /// Header flag: the capture time comes from the kernel or the device, not from the moment of arrival.
 pub const FLAG_DEVICE_TIME: u32 = 2;
+/// Header flag: its source gave it the number of the sample before it. It may be that sample again, and what the source
+/// lost does not show.
+pub const FLAG_SAME_NUMBER: u32 = 4;
 
 /// Whether the numbers of an [`Encoding::F64`] payload can be used: there is one at least, and each is finite, also in the
 /// 32 bits that a policy and a dataset have for it. Any other sample of numbers is damaged, whoever sent it.

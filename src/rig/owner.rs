@@ -10,6 +10,7 @@ use std::time::Duration;
 use futures::StreamExt;
 use rapid_bus::{Bus, TopicId, Writer};
 use rapid_core::action::{ActuatorNotice, Arming};
+use rapid_core::clip::ClipNotice;
 use rapid_core::mask::SizedMask;
 use rapid_core::modality::ModalityId;
 use rapid_core::permission::Permission;
@@ -345,7 +346,7 @@ impl Rig {
             Report::Event(event) => return self.step(Input::Stream { id, epoch, event }),
             Report::LinkDown => self.step(Input::Stream { id, epoch, event: StreamEvent::LinkDown }),
             Report::Opened(..) => self.step(Input::Stream { id, epoch, event: StreamEvent::Opened }),
-            Report::Silent(_) | Report::Refused(_) | Report::Actuator(_) | Report::Clock(_) => {}
+            Report::Silent(_) | Report::Refused(_) | Report::Actuator(_) | Report::Clock(_) | Report::Clip(_) => {}
         }
         let Some(modality) = self.modalities.iter_mut().find(|modality| modality.spec.id == id) else { return };
         let device = modality.spec.name.clone();
@@ -372,6 +373,7 @@ impl Rig {
             Report::Clock(ClockOffset { offset_ns, uncertainty_ns }) => {
                 EventKind::Clock { device, bit: id, offset_ns, uncertainty_ns }
             }
+            Report::Clip(ClipNotice { state, text }) => EventKind::Clip { device, bit: id, state, text },
             Report::Actuator(ActuatorNotice { arming, text, is_problem }) => {
                 modality.detail = format!("{}: {text}", arming.word());
                 modality.arming = Some(arming);

@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use rapid_bus::Writer;
 use rapid_core::action::ActuatorNotice;
+use rapid_core::clip::ClipNotice;
 use rapid_core::modality::ModalityId;
 use rapid_core::sample::{Epoch, SampleHeader, damage};
 use rapid_core::time::{Stamp, nanoseconds};
@@ -64,6 +65,8 @@ pub(super) enum Report {
     Actuator(ActuatorNotice),
     /// The clock of the phone, or of the computer that the device is on, with the worst uncertainty since the last report.
     Clock(ClockOffset),
+    /// What the device does that records by itself.
+    Clip(ClipNotice),
 }
 
 /// A report with its sender.
@@ -146,10 +149,11 @@ impl Stream {
             Err(_) => return Ended::retry(format!("did not open within {} s", OPEN_LIMIT.as_secs())),
         };
         let mut notices = source.notices();
+        let mut clips = source.clips();
         tokio::select! {
             biased;
             () = self.stop.cancelled() => {}
-            ended = self.read(&mut source, &mut notices) => {
+            ended = self.read(&mut source, &mut notices, &mut clips) => {
                 // The notices that it sent before it ended.
                 self.pass_on_notices(&mut notices).await;
                 return ended;
@@ -159,7 +163,12 @@ impl Stream {
         stopped()
     }
 
-    async fn read(&self, source: &mut SampleSource, notices: &mut Notices) -> Ended {
+    async fn read(
+        &self,
+        source: &mut SampleSource,
+        notices: &mut Notices<ActuatorNotice>,
+        clips: &mut Notices<ClipNotice>,
+    ) -> Ended {
         self.report(Report::Opened(source.description(), Box::new(self.provenance(source)))).await;
         let patience = source.patience(self.spec.stall_after);
         let mut progress = StreamProgress::default();
@@ -203,6 +212,7 @@ impl Stream {
                     }
                 }
                 notice = next_notice(notices) => self.report(Report::Actuator(notice)).await,
+                clip = next_notice(clips) => self.report(Report::Clip(clip)).await,
                 () = &mut news => {
                     self.pass_on_episode(source, &mut episode).await;
                     news.set(changed(episode.clone()));
@@ -275,7 +285,7 @@ impl Stream {
     }
 
     /// Reports the actuator's pending notices.
-    async fn pass_on_notices(&self, notices: &mut Notices) {
+    async fn pass_on_notices(&self, notices: &mut Notices<ActuatorNotice>) {
         while let Some(Ok(notice)) = notices.as_mut().map(mpsc::Receiver::try_recv) {
             self.report(Report::Actuator(notice)).await;
         }
@@ -384,10 +394,10 @@ enum Pulse {
     Stalled,
 }
 
-type Notices = Option<mpsc::Receiver<ActuatorNotice>>;
+type Notices<T> = Option<mpsc::Receiver<T>>;
 
 /// The next notice. Never returns if there are none or the sender has ended.
-async fn next_notice(notices: &mut Notices) -> ActuatorNotice {
+async fn next_notice<T>(notices: &mut Notices<T>) -> T {
     if let Some(notices) = notices
         && let Some(notice) = notices.recv().await
     {

@@ -534,6 +534,7 @@ mod tests {
             marks: vec![Mark { at: 12.5, text: String::new() }, Mark { at: 13.0, text: "grasp".to_owned() }],
             task: "place block".to_owned(),
             sensors: Some(Sensors { registered: 3, recorded: 2, without: vec!["tof".to_owned()], away: Vec::new() }),
+            replay_of: vec!["before.mcap".to_owned()],
         }
     }
 

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use rapid_core::action::Arming;
+use rapid_core::clip::ClipState;
 use rapid_core::mask::SizedMask;
 use rapid_core::modality::ModalityId;
 use rapid_core::provenance::{KernelDriver, Negotiated, UnplugSource};
@@ -177,6 +178,17 @@ pub enum EventKind {
         offset_ns: i64,
         /// How far that, and so the capture times since the last such event, may be wrong, either way, ns.
         uncertainty_ns: u64,
+    },
+    /// What a device that records by itself does about the episode in progress.
+    Clip {
+        /// Modality.
+        device: String,
+        /// Its bit.
+        bit: ModalityId,
+        /// What its own recording does.
+        state: ClipState,
+        /// Why, for people; may be empty.
+        text: String,
     },
     /// An actuator was armed or disarmed, or disabled itself.
     Actuator {
@@ -418,6 +430,15 @@ impl EventKind {
                 let rest = format!("of the device is {offset:+.6} s from this one, within {within:.3} ms");
                 D::joined(Level::Debug, device, "clock", " ", &rest).with_bit(*bit)
             }
+            Self::Clip { device, bit, state, text } => {
+                let level = match state {
+                    ClipState::Asked => Level::Debug,
+                    ClipState::Recording => Level::Info,
+                    ClipState::Refused | ClipState::Stopped => Level::Warn,
+                };
+                let rest = if text.is_empty() { String::new() } else { format!(": {text}") };
+                D::joined(level, device, "clip", " ", &format!("{}{rest}", state.word())).with_bit(*bit)
+            }
             Self::Actuator { device, bit, arming, is_problem, text } => {
                 let prefix = format!("{device}: ");
                 let sentence = format!("{prefix}{text}");
@@ -462,6 +483,7 @@ impl EventKind {
             | Self::Detach { device, .. }
             | Self::State { device, .. }
             | Self::Clock { device, .. }
+            | Self::Clip { device, .. }
             | Self::Actuator { device, .. } => (Some(device), None),
             Self::Printed { device, printed, .. } => (Some(device), Some(*printed)),
             _ => (None, None),

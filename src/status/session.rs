@@ -274,6 +274,9 @@ pub struct EpisodeEntry {
     /// Which sensors took part.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sensors: Option<Sensors>,
+    /// The names of the files that were replayed.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub replay_of: Vec<String>,
 }
 
 impl EpisodeEntry {
@@ -292,6 +295,7 @@ impl EpisodeEntry {
             discarded: false,
             marks: Vec::new(),
             sensors: None,
+            replay_of: Vec::new(),
         }
     }
 
@@ -301,6 +305,7 @@ impl EpisodeEntry {
         self.verdict = Some(verdict.grade);
         self.reasons.clone_from(&verdict.reasons);
         self.sensors.clone_from(&verdict.sensors);
+        self.replay_of.clone_from(&verdict.replay_of);
     }
 
     /// What people noted about it.

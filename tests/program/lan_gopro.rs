@@ -17,6 +17,8 @@ use serde_json::Value;
 struct Gopro {
     asked: Mutex<Vec<String>>,
     recording: AtomicBool,
+    /// The card is full: it answers so to the order to record.
+    refuses: AtomicBool,
     clips: AtomicU32,
     /// What sends its preview, if it was asked for one.
     preview: Mutex<Option<Child>>,
@@ -59,6 +61,10 @@ impl Gopro {
             "/gopro/camera/info" => br#"{"model_name":"HERO11 Black","firmware_version":"H22.01"}"#.to_vec(),
             "/gopro/camera/state" => {
                 format!(r#"{{"status":{{"8":0,"10":{},"70":90}}}}"#, u8::from(recording())).into_bytes()
+            }
+            "/gopro/camera/shutter/start" if self.refuses.load(Ordering::Relaxed) => {
+                let _ = stream.write_all(b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n\r\n");
+                return;
             }
             "/gopro/camera/shutter/start" => {
                 self.recording.store(true, Ordering::Relaxed);
@@ -141,6 +147,56 @@ fn a_gopro_records_with_the_episode_and_its_clip_is_noted_beside_it() {
         serde_json::from_str(&note.unwrap_or_else(|_| panic!("no note in {files:?}: {reported:#?}"))).expect("JSON");
     assert_eq!((note["folder"].as_str(), note["file"].as_str()), (Some("100GOPRO"), Some("GX010001.MP4")));
     assert_eq!(note["size"].as_u64(), Some(Gopro::CLIP));
+}
+
+/// Waits until the camera's own recording was reported so.
+fn wait_for_clip(running: &support::Running, word: &str) {
+    until(word, || running.reported().iter().any(|event| event["event"] == "clip" && event["state"] == word));
+}
+
+/// The verdict when it ends, and that of the file.
+fn verdict_at_the_end(place: &Place, running: support::Running) -> (Value, Value) {
+    // Long enough to be an episode.
+    let begun = place.published();
+    until("half a second", || place.published() > begun + 300);
+    let ended = stop(running).into_iter().find(|event| event["event"] == "episode").expect("an episode");
+    let file = ended["file"].as_str().expect("a file").to_owned();
+    let inspected = place.run(&["--json", "inspect", &file]);
+    (ended, serde_json::from_slice(&inspected.stdout).expect("JSON"))
+}
+
+#[test]
+fn an_episode_that_a_gopro_did_not_record_as_asked_is_not_good() {
+    for refuses in [true, false] {
+        let (place, [port]) = (Place::new(), free_ports());
+        place.write("devices.toml", &gopro_entry(port, ""));
+        let (gopro, _server) = gopro_at(port);
+        gopro.refuses.store(refuses, Ordering::Relaxed);
+        let running = place.start(&[&RUN[..], &["--record", "--out", "out"]].concat(), "begin");
+        wait_for(&running, "gopro", "streaming", 1);
+        wait_for_clip(&running, "asked");
+        if refuses {
+            wait_for_clip(&running, "refused");
+        } else {
+            wait_for_clip(&running, "recording");
+            // Its battery is empty, or someone presses the button.
+            gopro.recording.store(false, Ordering::Relaxed);
+            gopro.clips.fetch_add(1, Ordering::Relaxed);
+            wait_for_clip(&running, "stopped");
+        }
+        let (ended, inspected) = verdict_at_the_end(&place, running);
+        let (grade, words) = if refuses {
+            ("BAD", "gopro: recorded nothing by itself; it refused ")
+        } else {
+            ("SUSPECT", ", stopped 1 time")
+        };
+        let is_it =
+            |reason: &Value| reason.as_str().is_some_and(|text| text.starts_with("gopro: ") && text.contains(words));
+        assert!(ended["reasons"].as_array().is_some_and(|all| all.iter().any(is_it)), "{words:?} in {ended}");
+        assert!(ended["verdict"] == grade || ended["verdict"] == "BAD", "{ended}");
+        assert_eq!((&inspected["verdict"], &inspected["reasons"]), (&ended["verdict"], &ended["reasons"]));
+        assert_eq!(refuses, !place.files("out").iter().any(|name| name.ends_with("gopro.clip.json")));
+    }
 }
 
 /// Pictures of a small preview.

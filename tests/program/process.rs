@@ -332,6 +332,28 @@ fn a_program_that_is_behind_is_never_good_however_far() {
 }
 
 #[test]
+fn a_program_that_repeats_one_number_sends_duplicates() {
+    let place = Place::new();
+    registry(&place, ", \"--same-number\"", "");
+    let output = place.run(&[&sim(&place, "")[..], &["--record", "--duration", "2s", "--out", "out"]].concat());
+    let reported = events(&String::from_utf8_lossy(&output.stdout));
+    let ended = find(&reported, |event| event["event"] == "episode", "episode");
+    let is_named = |reason: &Value| {
+        reason
+            .as_str()
+            .is_some_and(|text| text.starts_with("counter: ") && text.contains("with a non-increasing sequence"))
+    };
+    assert!(
+        ended["verdict"] == "BAD" && ended["reasons"].as_array().is_some_and(|all| all.iter().any(is_named)),
+        "{ended}"
+    );
+    assert_eq!(logged(&reported, "counter: samples are duplicates, of seq 7 again").len(), 1, "{reported:#?}");
+    let inspected = place.run(&["inspect", "--json", &format!("out/{}", place.files("out")[0])]);
+    let inspected: Value = serde_json::from_slice(&inspected.stdout).expect("JSON");
+    assert_eq!(inspected["reasons"], ended["reasons"], "the recorder and a reader of the file agree");
+}
+
+#[test]
 fn a_program_that_floods_its_output_is_thinned_and_its_samples_are_whole() {
     let place = Place::new();
     registry(&place, ", \"--flood-stderr\"", "");

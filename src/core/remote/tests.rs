@@ -73,7 +73,7 @@ fn what_is_no_frame_is_refused_with_the_reason() {
     assert_eq!(with(12, 7), Some(FrameError::Field("encoding", 7)));
     // A mask is not a sample of a device.
     assert_eq!(with(12, 5), Some(FrameError::Field("encoding", 5)));
-    assert_eq!(with(48, 4), Some(FrameError::Field("flags", 4)));
+    assert_eq!(with(48, 8), Some(FrameError::Field("flags", 8)));
     assert_eq!(with(8, 101), Some(FrameError::TooLong { length: 101, most: 100 }));
     assert_eq!(with(8, u32::MAX), Some(FrameError::TooLong { length: u32::MAX, most: 100 }));
     assert_eq!(with(4, 1), Some(FrameError::Field("encoding", 2)));
@@ -113,7 +113,7 @@ proptest! {
 
     #[test]
     fn a_head_is_read_as_written(
-        seq: u64, capture_ns: u64, offset_ns: i64, uncertainty_ns: u64, flags in 0_u32..4, size: (u32, u32),
+        seq: u64, capture_ns: u64, offset_ns: i64, uncertainty_ns: u64, flags in 0_u32..8, size: (u32, u32),
     ) {
         let head = Head { seq, capture_ns, offset_ns, uncertainty_ns, flags, width: size.0, height: size.1, ..sample(b"") };
         prop_assert_eq!(Head::read(&head.bytes(), 0), Ok(head));

@@ -23,6 +23,7 @@ use std::sync::Arc;
 
 use futures::future::BoxFuture;
 use rapid_core::action::{ActionSource, ActuatorNotice, Order};
+use rapid_core::clip::ClipNotice;
 use rapid_core::permission::Attended;
 use rapid_core::provenance::Negotiated;
 use rapid_core::sample::Encoding;
@@ -244,6 +245,15 @@ impl Driver {
             #[cfg(feature = "motors")]
             Self::Motors(driver) => driver.notices(),
             Self::Sim(driver) => Some(driver.joints.notices()),
+            _ => None,
+        }
+    }
+
+    /// What a device that records by itself does; `Some` at the first call only.
+    pub fn clips(&mut self) -> Option<mpsc::Receiver<ClipNotice>> {
+        match self {
+            #[cfg(feature = "lan")]
+            Self::Lan(driver) => driver.clips(),
             _ => None,
         }
     }

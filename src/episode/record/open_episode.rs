@@ -25,7 +25,7 @@ use std::time::Duration;
 
 use rapid_core::mask::{Bits, PhysicalMask};
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};
-use rapid_core::sample::{Epoch, FLAG_ERROR, SampleHeader, are_usable_numbers};
+use rapid_core::sample::{Epoch, FLAG_ERROR, FLAG_SAME_NUMBER, SampleHeader, are_usable_numbers};
 use rapid_core::sync::{Grid, SyncSample, Synchronizer};
 use rapid_core::time::{Stamp, WallClock};
 use rapid_pictures::judge::PictureJudge;
@@ -205,7 +205,9 @@ impl OpenEpisode {
         }
         let flagged = header.flags & FLAG_ERROR != 0;
         let picture = self.judge.sample(id, header, payload);
+        let again = header.flags & FLAG_SAME_NUMBER != 0;
         let seen = SampleFacts {
+            again,
             seq: header.seq,
             capture_ns: header.capture_ns,
             recv_ns: header.recv_ns,
@@ -283,6 +285,9 @@ impl OpenEpisode {
         self.events += 1;
         if let EventKind::Attach { bit, .. } | EventKind::Detach { bit, .. } = &event.what {
             self.measures.plugged(*bit, event.stamp.0, matches!(event.what, EventKind::Attach { .. }));
+        }
+        if let EventKind::Clip { bit, state, .. } = &event.what {
+            self.measures.clip(*bit, event.stamp.0, *state);
         }
         if let EventKind::Clock { bit, uncertainty_ns, .. } = &event.what {
             self.measures.uncertainty(*bit, *uncertainty_ns);

@@ -15,6 +15,7 @@ use std::hash::{DefaultHasher, Hasher};
 use std::time::Duration;
 
 use hdrhistogram::Histogram;
+use rapid_core::clip::ClipState;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId};
 use rapid_core::sync::Grid;
@@ -130,6 +131,9 @@ pub struct Quality {
     pub nominal_hz: Option<f64>,
     /// Longest time without a sample while it was present, seconds.
     pub longest_gap: f64,
+    /// Its own recording, of a device that was asked to record by itself.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub clip: Option<ClipQuality>,
     /// Frames in which it was present.
     pub frames_present: u64,
     /// Frames with a sample of it in the window.
@@ -137,6 +141,19 @@ pub struct Quality {
     /// Frames in which it was present without such a sample. The first and the last of a presence are not counted:
     /// their sample may lie outside the presence or the episode.
     pub frames_missed: u64,
+}
+
+/// What a device that records by itself has of an episode, by the events.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct ClipQuality {
+    /// Time in which it reported that it records, seconds.
+    pub recorded: f64,
+    /// When it first did, seconds from the beginning; `None`: never.
+    pub began: Option<f64>,
+    /// How often it was asked and did not begin.
+    pub refused: u64,
+    /// How often it stopped without being asked to.
+    pub stopped: u64,
 }
 
 impl Quality {
@@ -166,6 +183,7 @@ struct ModalityMeters {
     pending: Vec<(u64, u64)>,
     plugged: Plugged,
     uncertainty_ns: Option<u64>,
+    clip: ClipMeter,
 }
 
 impl Measures {
@@ -182,6 +200,7 @@ impl Measures {
                     pending: Vec::with_capacity(PENDING),
                     plugged: Plugged::default(),
                     uncertainty_ns: None,
+                    clip: ClipMeter::default(),
                 });
             }
         }
@@ -236,6 +255,17 @@ impl Measures {
     pub(super) fn plugged(&mut self, id: ModalityId, at_ns: u64, there: bool) {
         if let Some(Some(modality)) = self.modalities.get_mut(id.index()) {
             modality.plugged.push(at_ns, there);
+            if !there {
+                // Nothing is known of its recording from here on.
+                modality.clip.recording.push(at_ns, false);
+            }
+        }
+    }
+
+    /// Takes what a device that records by itself does.
+    pub(super) fn clip(&mut self, id: ModalityId, at_ns: u64, state: ClipState) {
+        if let Some(Some(modality)) = self.modalities.get_mut(id.index()) {
+            modality.clip.push(at_ns, state);
         }
     }
 
@@ -286,7 +316,7 @@ impl Measures {
 
     /// The quality of a modality in an episode that ended at `end_ns`; `None` if it is not measured.
     pub(super) fn quality(&self, id: ModalityId, end_ns: u64) -> Option<Quality> {
-        let ModalityMeters { measured, meter, longest_gap_ns, pending, plugged, uncertainty_ns } =
+        let ModalityMeters { measured, meter, longest_gap_ns, pending, plugged, uncertainty_ns, clip } =
             self.modalities.get(id.index())?.as_ref()?;
         let gaps = pending.iter().copied().chain([(meter.latest_ns, end_ns)]);
         let longest_gap_ns =
@@ -303,6 +333,7 @@ impl Measures {
             lateness: meter.lateness.spread(),
             clock_drift: meter.drift.over_the_episode().map(|ns| ns as f64 / 1e6),
             clock_ahead: meter.ahead_ns as f64 / 1e6,
+            clip: clip.quality(self.begin_ns, end_ns),
             clock_uncertainty: uncertainty_ns.map(|ns| ns as f64 / 1e6),
             offset: meter.offset.spread(),
             presence: (known && length > 0.0).then(|| (present / length).clamp(0.0, 1.0)),
@@ -336,6 +367,40 @@ impl ModalityMeters {
     }
 }
 
+/// When a device that records by itself did.
+#[derive(Debug, Default)]
+struct ClipMeter {
+    is_asked: bool,
+    recording: Plugged,
+    first_ns: Option<u64>,
+    refused: u64,
+    stopped: u64,
+}
+
+impl ClipMeter {
+    fn push(&mut self, at_ns: u64, state: ClipState) {
+        self.is_asked = true;
+        self.recording.push(at_ns, state == ClipState::Recording);
+        match state {
+            ClipState::Asked => {}
+            ClipState::Recording => drop(self.first_ns.get_or_insert(at_ns)),
+            ClipState::Refused => self.refused += 1,
+            ClipState::Stopped => self.stopped += 1,
+        }
+    }
+
+    fn quality(&self, begin_ns: u64, end_ns: u64) -> Option<ClipQuality> {
+        let Self { is_asked, recording, first_ns, refused, stopped } = self;
+        let seconds = |ns: u64| ns as f64 / 1e9;
+        is_asked.then(|| ClipQuality {
+            recorded: seconds(recording.total(begin_ns, end_ns)),
+            began: first_ns.map(|first| seconds(first.saturating_sub(begin_ns))),
+            refused: *refused,
+            stopped: *stopped,
+        })
+    }
+}
+
 /// The measured properties of a sample.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct SampleFacts<'a> {
@@ -347,6 +412,8 @@ pub(super) struct SampleFacts<'a> {
     pub(super) recv_ns: u64,
     /// The driver called it damaged.
     pub(super) flagged: bool,
+    /// Its source gave it the number of the sample before it.
+    pub(super) again: bool,
     /// Whether it is usable, if it is a picture.
     pub(super) picture: Judgement,
     pub(super) payload: &'a [u8],
@@ -435,7 +502,7 @@ impl Meter {
         self.counts.other_shape += u64::from(seen.picture == Judgement::OtherShape);
         self.counts.damaged += u64::from(!seen.picture.is_usable() || seen.flagged);
         // A lower number at a later time is a restarted publisher.
-        let again = self.seq == Some(seen.seq) || (!first && seen.capture_ns <= self.latest_ns);
+        let again = seen.again || self.seq == Some(seen.seq) || (!first && seen.capture_ns <= self.latest_ns);
         self.counts.duplicates += u64::from(again);
         self.seq = Some(seen.seq);
         self.counts.late += u64::from(seen.recv_ns > deadline_ns);

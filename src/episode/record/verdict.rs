@@ -28,7 +28,7 @@ use rapid_registry::{Limits, VerdictSpec};
 use rapid_status::{Absence, Finding, Grade, Sensors, Verdict};
 
 use super::publishers::Publisher;
-use super::quality::Quality;
+use super::quality::{ClipQuality, Quality};
 use super::sources::{self, Epochs};
 
 /// A modality with its limits.
@@ -154,6 +154,7 @@ pub(super) fn findings(facts: &Facts<'_>) -> Vec<Finding> {
                 of_it.push((grade, "took no part, and is expected (expect under [rig])".to_owned()));
             }
         }
+        of_it.extend(clip(judged.quality, &judged.limits, facts.seconds));
         let modality = || Some(judged.name.to_owned());
         found.extend(of_it.into_iter().map(|(grade, text)| Finding { grade, modality: modality(), text }));
     }
@@ -294,6 +295,25 @@ fn uncertain(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)>
     let (grade, limit) = longer(limits, |limits| limits.uncertain, uncertainty)?;
     let text = format!("capture times uncertain by ±{} (limit {limit})", seconds(uncertainty));
     Some((grade, text))
+}
+
+/// The own recording of a device that was asked to record by itself.
+fn clip(quality: &Quality, limits: &VerdictSpec, length: f64) -> Option<(Grade, String)> {
+    let ClipQuality { recorded, began, refused, stopped } = quality.clip?;
+    let times = |count: u64| text::counted(count, "time");
+    let Some(began) = began.filter(|_| recorded > 0.0) else {
+        limits.suspect.clip.or(limits.bad.clip)?;
+        return Some((Grade::Bad, format!("recorded nothing by itself; it refused {}", times(refused))));
+    };
+    let lacks = (length - recorded).max(0.0);
+    // How much is missing before it was noticed that it stopped is not known.
+    let broken = || (refused + stopped > 0 && limits.suspect.clip.is_some()).then(|| (Grade::Suspect, "0".to_owned()));
+    let (grade, limit) = longer(limits, |limits| limits.clip, lacks).or_else(broken)?;
+    let (lacks, length, began) = (seconds(lacks), seconds(length), seconds(began));
+    let refused = if refused > 0 { format!(", refused {}", times(refused)) } else { String::new() };
+    let stopped = if stopped > 0 { format!(", stopped {}", times(stopped)) } else { String::new() };
+    let how = format!("it began after {began}{refused}{stopped} (limit {limit})");
+    Some((grade, format!("its own recording lacks {lacks} of {length}: {how}")))
 }
 
 fn rate(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {

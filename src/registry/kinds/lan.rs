@@ -377,6 +377,9 @@ impl Kind for LanSpec {
             // Its samples report its state once a second, and are not observations: its pictures are in the clip.
             (limits.suspect.valid, limits.bad.valid) = (None, None);
         }
+        if matches!(self.protocol, LanProtocol::Gopro { .. }) {
+            *limits = limits.of_a_recorder();
+        }
         if self.is_remote() || matches!(self.protocol, LanProtocol::Iphone { .. }) {
             *limits = limits.of_another_clock(sync_window);
         }

@@ -48,6 +48,8 @@ keys! {
         clock = TIME, usually "10 ms, 100 ms";
         /// How far the capture times of a device with a clock of its own, a phone or another computer, may be wrong.
         uncertain = TIME, usually "half of `sync_window`, off; others off";
+        /// Time of the episode that a device which records by itself did not record; one that recorded nothing is always BAD.
+        clip = TIME, usually "2 s, off of GoPros; others off";
     }
 }
 
@@ -87,12 +89,13 @@ const SHARES: [(Share, Worse); 9] = [
     (|limits| &mut limits.present, Worse::Less),
 ];
 /// The others: those that are a time; longer is worse.
-const TIMES: [Moment; 5] = [
+const TIMES: [Moment; 6] = [
     |limits| &mut limits.frozen,
     |limits| &mut limits.gap,
     |limits| &mut limits.opening,
     |limits| &mut limits.clock,
     |limits| &mut limits.uncertain,
+    |limits| &mut limits.clip,
 ];
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -35,6 +35,8 @@ pub struct Limits {
     pub clock: Option<Duration>,
     /// How far the capture times may be wrong, of a device of another computer.
     pub uncertain: Option<Duration>,
+    /// Time of the episode that a device which records by itself did not record.
+    pub clip: Option<Duration>,
     /// Least rate while the device was attached, as a share of the nominal one.
     pub rate: Option<f64>,
     /// Least share of the ticks while the device was attached that have a sample of it in `sync_window`.
@@ -90,6 +92,7 @@ impl VerdictSpec {
             opening: Some(Duration::from_secs(5)),
             clock: Some(Duration::from_millis(10)),
             uncertain: None,
+            clip: None,
             rate: Some(0.9),
             valid: Some(0.9),
             present: None,
@@ -106,6 +109,7 @@ impl VerdictSpec {
             opening: None,
             clock: Some(Duration::from_millis(100)),
             uncertain: None,
+            clip: None,
             rate: Some(0.5),
             valid: Some(0.5),
             present: None,
@@ -117,6 +121,13 @@ impl VerdictSpec {
     #[must_use]
     pub fn of_an_expected_sensor(mut self) -> Self {
         (self.suspect.present, self.bad.present) = (Some(0.9), Some(0.5));
+        self
+    }
+
+    /// Also judges its own recording: a camera begins within two seconds.
+    #[must_use]
+    pub fn of_a_recorder(mut self) -> Self {
+        self.suspect.clip = Some(Duration::from_secs(2));
         self
     }
 

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rapid_core::action::{ActionSource, ActuatorNotice, Order};
+use rapid_core::clip::ClipNotice;
 use rapid_core::permission::Attended;
 use rapid_core::provenance::Negotiated;
 use rapid_devices::driver::{ClockOffset, Driver, DriverError, Reading};
@@ -73,6 +74,10 @@ impl SampleSource {
 
     pub(super) fn notices(&mut self) -> Option<mpsc::Receiver<ActuatorNotice>> {
         self.driver()?.notices()
+    }
+
+    pub(super) fn clips(&mut self) -> Option<mpsc::Receiver<ClipNotice>> {
+        self.driver()?.clips()
     }
 
     pub(super) fn record(&mut self, episode: Option<&Arc<Episode>>) -> Result<(), DriverError> {

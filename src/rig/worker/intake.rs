@@ -4,7 +4,8 @@
 //! 2. The payload must be what the entry declares, or the sample is refused.
 //! 3. A capture time that cannot be one makes the sample damaged ([`rapid_core::capture`]). 0 means that the program does not
 //!    know.
-//! 4. A gap in `seq` is a loss; a counter that jumps or restarts is not.
+//! 4. A gap in `seq` is a loss; a counter that jumps or restarts is not. A number that is repeated shows that nothing is
+//!    counted: the sample is passed on, and is a duplicate.
 //!
 //! Invariant: pure; nothing a program can write makes this panic, or passes a number that our own driver would not have
 //! sent.
@@ -13,7 +14,7 @@ use std::time::Duration;
 
 use rapid_core::capture::{CaptureTimes, Captured};
 use rapid_core::modality::{ModalityId, ModalityKind};
-use rapid_core::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, FLAG_ERROR, SampleHeader};
+use rapid_core::sample::{Encoding, Epoch, FLAG_DEVICE_TIME, FLAG_ERROR, FLAG_SAME_NUMBER, SampleHeader};
 use rapid_core::time::Stamp;
 use rapid_registry::ProcessSpec;
 
@@ -68,6 +69,7 @@ pub(super) struct Intake {
     complaint: Option<String>,
     has_refused: bool,
     has_doubted: bool,
+    has_repeated: bool,
 }
 
 impl Intake {
@@ -87,6 +89,7 @@ impl Intake {
             complaint: None,
             has_refused: false,
             has_doubted: false,
+            has_repeated: false,
         }
     }
 
@@ -101,7 +104,16 @@ impl Intake {
                 return None;
             }
         };
-        let (captured, flags) = self.time(header, now);
+        let (captured, mut flags) = self.time(header, now);
+        if self.last == Some(header.seq) {
+            flags |= FLAG_SAME_NUMBER;
+            if self.complaint.is_none() && !std::mem::replace(&mut self.has_repeated, true) {
+                let seq = header.seq;
+                self.complaint = Some(format!(
+                    "samples are duplicates, of seq {seq} again: a program must count its samples in seq"
+                ));
+            }
+        }
         let hole = self.last.and_then(|last| header.seq.checked_sub(last)?.checked_sub(1));
         self.last = Some(header.seq);
         let lost = hole.filter(|hole| *hole <= LARGEST_HOLE).unwrap_or(0);

@@ -4,7 +4,8 @@
 //! then every 3 s a keep-alive and a query of the camera's state, which is the sample, in JSON:
 //! `{"recording":bool,"busy":bool,"battery_percent":n,"card_free_kb":n,"remaining_s":n}`, null for unknown values. The
 //! shutter starts and stops with an episode (`camera`); its clip's name is written beside the episode, and the clip is
-//! fetched if the entry requests it (`clip`), by the next run if this one ends before.
+//! fetched if the entry requests it (`clip`), by the next run if this one ends before. What the shutter does is reported
+//! ([`ClipNotice`]): whether the camera recorded an episode is part of the verdict on it.
 //!
 //! The camera gives itself 172.2X.1YZ.51 and its host an address in the same network; XYZ are the last digits of its
 //! serial number.
@@ -27,6 +28,7 @@ use std::net::Ipv4Addr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use rapid_core::clip::{ClipNotice, ClipState};
 use rapid_core::sample::Encoding;
 use rapid_core::time::Stamp;
 use rapid_registry::LanPicture;
@@ -54,6 +56,20 @@ const LOOK_FOR_ADDRESS: Duration = Duration::from_millis(200);
 /// A missing answer is requested again.
 const TRIES: u32 = 2;
 
+/// Notices that wait to be read.
+const NOTICES: usize = 64;
+
+/// Reports what the camera's own recording does.
+#[derive(Debug, Clone)]
+struct ClipReports(mpsc::Sender<ClipNotice>);
+
+impl ClipReports {
+    fn send(&self, state: ClipState, text: String) {
+        // Without room nobody reads them any more.
+        let _ = self.0.try_send(ClipNotice { state, text });
+    }
+}
+
 /// How clips are handled.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Clips {
@@ -67,6 +83,8 @@ pub(super) struct Clips {
 pub(super) struct Gopro {
     states: mpsc::Receiver<Result<State, DriverError>>,
     reported: watch::Sender<ReportedEpisode>,
+    clips: ClipReports,
+    notices: Option<mpsc::Receiver<ClipNotice>>,
     task: AbortOnDropHandle<()>,
     model: Option<String>,
     payload: Vec<u8>,
@@ -112,9 +130,12 @@ impl Gopro {
         let books = Books::open(state.as_deref(), serial.as_deref().unwrap_or(name)).await;
         let (notify, states) = mpsc::channel(4);
         let (reported, tasks) = watch::channel(None);
-        let camera = Camera::new(name, server, clips, books, notify, limits).await;
+        let (sender, notices) = mpsc::channel(NOTICES);
+        let reports = ClipReports(sender);
+        let camera = Camera::new(name, server, clips, books, notify, reports.clone(), limits).await;
         let task = AbortOnDropHandle::new(tokio::spawn(camera.run(tasks)));
-        Ok(Self { states, reported, task, model: answer::model(&info), payload: Vec::new(), preview: None })
+        let (model, payload, notices) = (answer::model(&info), Vec::new(), Some(notices));
+        Ok(Self { states, reported, clips: reports, notices, task, model, payload, preview: None })
     }
 
     pub(super) async fn read(&mut self) -> Result<Reading<'_>, DriverError> {
@@ -153,7 +174,15 @@ impl Gopro {
 
     /// The episode that will be saved as `episode` begins, or with `None` the one in progress ends.
     pub(super) fn record(&self, episode: Option<PathBuf>) {
+        if episode.is_some() {
+            self.clips.send(ClipState::Asked, String::new());
+        }
         self.reported.send_replace(Some(episode));
+    }
+
+    /// What its own recording does; `Some` at the first call only.
+    pub(super) fn clips(&mut self) -> Option<mpsc::Receiver<ClipNotice>> {
+        self.notices.take()
     }
 
     /// Stops the shutter, if this program started it, and notes the clip.

@@ -22,9 +22,12 @@ mod udp;
 
 use std::time::Duration;
 
+use rapid_core::clip::ClipNotice;
 use rapid_core::provenance::{Format, Negotiated};
 use rapid_registry::device::DeviceNode;
 use rapid_registry::{DeviceSpec, LanFind, LanPicture, LanProtocol, LanSpec, RemoteSamples};
+
+use tokio::sync::mpsc;
 
 use super::{Agreed, ClockOffset, DriverError, Reading};
 use crate::link::{LinkState, LinkWatch, NetworkLink};
@@ -125,6 +128,11 @@ impl Lan {
             Protocol::Iphone(phone) => phone.clock(),
             Protocol::Mjpeg(_) | Protocol::Udp(_) | Protocol::Gopro(_) => None,
         }
+    }
+
+    /// What a camera that records by itself does; `Some` at the first call only.
+    pub fn clips(&mut self) -> Option<mpsc::Receiver<ClipNotice>> {
+        if let Protocol::Gopro(gopro) = &mut self.protocol { gopro.clips() } else { None }
     }
 
     /// The episode with this file begins, or with `None` the one in progress ends: a camera that records by itself

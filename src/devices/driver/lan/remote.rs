@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use rapid_core::capture::{CaptureTimes, Captured};
 use rapid_core::remote::{FrameError, Frames, Head, Kind, request};
-use rapid_core::sample::{Encoding, FLAG_ERROR};
+use rapid_core::sample::{Encoding, FLAG_ERROR, FLAG_SAME_NUMBER};
 use rapid_core::time::Stamp;
 use rapid_registry::{PixelFormat, RemoteSamples};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -96,6 +96,7 @@ impl Remote {
         };
         self.check(&head, encoding)?;
         let missing = self.newest.map_or(0, |newest| head.seq.saturating_sub(newest.saturating_add(1)));
+        let again = if self.newest == Some(head.seq) { FLAG_SAME_NUMBER } else { 0 };
         self.newest = Some(head.seq);
         let Head { offset_ns, uncertainty_ns, .. } = head;
         self.clock = Some(ClockOffset { offset_ns, uncertainty_ns });
@@ -104,7 +105,7 @@ impl Remote {
             bytes: self.frames.payload(),
             encoding,
             captured,
-            flags,
+            flags: flags | again,
             width: head.width,
             height: head.height,
             lost: if missing < MOST_MISSING { missing } else { 0 },

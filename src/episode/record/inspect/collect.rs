@@ -188,6 +188,7 @@ impl Collected {
         match (&mut self.judge, kind) {
             (Some(judge), "publisher") => judge.publisher(json),
             (Some(judge), "clock") => judge.clock(device, json),
+            (Some(judge), "clip") => judge.clip(device, at, json),
             (Some(judge), "attach" | "detach") => {
                 self.plugs += 1;
                 if self.plugs <= MAX_EVENTS {

@@ -10,6 +10,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use rapid_core::clip::ClipState;
 use rapid_core::mask::PhysicalMask;
 use rapid_core::modality::{MAX_MODALITIES, ModalityId, ModalityKind};
 use rapid_core::sample::damage;
@@ -121,6 +122,19 @@ impl Judge {
         }
     }
 
+    /// Takes the event `clip` of a device, as JSON.
+    pub(super) fn clip(&mut self, device: &str, at_ns: u64, json: &str) {
+        #[derive(serde::Deserialize)]
+        struct Clip {
+            state: ClipState,
+        }
+        // One that cannot be read says nothing of a recording.
+        let state = serde_json::from_str::<Clip>(json).map_or(ClipState::Refused, |clip| clip.state);
+        if let Some(known) = self.modalities.iter().find(|known| known.name == device) {
+            self.measures.clip(known.id, at_ns, state);
+        }
+    }
+
     /// Takes the event `publisher`, as JSON.
     pub(super) fn publisher(&mut self, json: &str) {
         self.publishers.event(json);
@@ -138,9 +152,10 @@ impl Judge {
             seq: message.sequence.into(),
             capture_ns: message.log_time,
             recv_ns: message.publish_time,
-            // The flag is not in the file: what its content shows, in files of earlier versions too.
+            // The flags are not in the file: what its content shows, in files of earlier versions too.
             flagged: sample.is_some_and(|sample| damage(sample.encoding, sample.payload) != 0),
             picture,
+            again: false,
             payload: sample.map_or(&[], |sample| sample.payload),
             repeated: None,
         };
@@ -227,7 +242,8 @@ impl Judge {
             let all = gone.saturating_add(quality.lost).saturating_add(quality.dropped);
             (quality.lost, quality.dropped) = (0, all.max(missing));
         }
-        quality.damaged = quality.damaged.max(counted.of_modality(&known.name, "damaged").unwrap_or(0));
+        quality.damaged = quality.damaged.max(recorded("damaged").unwrap_or(0));
+        quality.duplicates = quality.duplicates.max(recorded("duplicates").unwrap_or(0));
         Some(quality)
     }
 

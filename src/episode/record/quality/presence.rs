@@ -76,6 +76,8 @@ impl PresenceHistory {
     }
 }
 
+/// Since when something is there or not, as events say it: whether a device is plugged in, whether it records by itself.
+///
 /// When a modality's device was plugged in, whether its node ran or not. In the mask an absent device looks like one that
 /// never starts; events distinguish them. Memory grows with how often it is plugged in and out.
 #[derive(Debug, Default)]
@@ -101,15 +103,25 @@ impl Plugged {
         }
     }
 
+    /// When it was there between `begin_ns` and `end_ns`, ascending.
+    fn spans(&self, begin_ns: u64, end_ns: u64) -> impl Iterator<Item = (u64, u64)> {
+        let span = move |(index, (at, there)): (usize, &(u64, bool))| {
+            let from = (*at).max(begin_ns);
+            let to = self.edges.get(index + 1).map_or(end_ns, |(next, _)| *next).min(end_ns);
+            (*there && from < to).then_some((from, to))
+        };
+        self.edges.iter().enumerate().filter_map(span)
+    }
+
+    /// How long it was there between `begin_ns` and `end_ns`, ns.
+    pub(super) fn total(&self, begin_ns: u64, end_ns: u64) -> u64 {
+        self.spans(begin_ns, end_ns).map(|(from, to)| to - from).sum()
+    }
+
     /// The times from `begin_ns` to `end_ns`.
     pub(super) fn time(&self, presence: &PresenceHistory, id: ModalityId, begin_ns: u64, end_ns: u64) -> Time {
         let mut time = Time::default();
-        for (index, (at, there)) in self.edges.iter().enumerate() {
-            let from = (*at).max(begin_ns);
-            let to = self.edges.get(index + 1).map_or(end_ns, |(next, _)| *next).min(end_ns);
-            if !there || from >= to {
-                continue;
-            }
+        for (from, to) in self.spans(begin_ns, end_ns) {
             time.plugged_ns += to - from;
             let mut ran_until = from;
             for (begin, end) in presence.spans(id, from, to) {

@@ -35,6 +35,7 @@ fn seen(seq: u64, at: u64, late: u64, payload: &[u8]) -> SampleFacts<'_> {
         capture_ns,
         recv_ns: capture_ns + late * MS,
         flagged: false,
+        again: false,
         picture: Judgement::Usable,
         payload,
         repeated: None,
@@ -102,6 +103,45 @@ fn a_non_increasing_number_or_time_is_a_duplicate() {
         measures.sample(id(0), &seen(seq, at, 1, b""));
         assert_eq!(quality_at(&measures, 100).duplicates, duplicates, "{seq} at {at} ms");
     }
+}
+
+#[test]
+fn samples_whose_source_repeats_its_number_are_duplicates() {
+    let mut measures = measures(ModalityKind::Scalars);
+    for (n, again) in [(0_u64, false), (1, true), (2, true), (3, false)] {
+        measures.sample(id(0), &SampleFacts { again, ..seen(n, 10 * n, 1, b"") });
+    }
+    assert_eq!(quality_at(&measures, 100).duplicates, 2);
+}
+
+#[test]
+fn the_time_that_a_device_recorded_by_itself_comes_from_events() {
+    use ClipState::{Asked, Recording, Refused, Stopped};
+    // Of ten seconds: events (ms), recorded and first (ms), refused, stopped.
+    type Row<'a> = (&'a [(u64, ClipState)], u64, Option<u64>, u64, u64);
+    let table: &[Row<'_>] = &[
+        (&[(100, Asked)], 0, None, 0, 0),
+        (&[(100, Asked), (500, Recording)], 9_500, Some(500), 0, 0),
+        (&[(100, Asked), (200, Refused), (3_000, Refused), (9_000, Recording)], 1_000, Some(9_000), 2, 0),
+        (&[(100, Asked), (500, Recording), (4_500, Stopped), (5_000, Recording)], 9_000, Some(500), 0, 1),
+        // Connected again, and found to record on: in between nothing is known.
+        (&[(100, Asked), (500, Recording), (4_500, Asked), (6_500, Recording)], 7_500, Some(500), 0, 0),
+    ];
+    for (events, recorded, began, refused, stopped) in table {
+        let mut measures = measures(ModalityKind::Bytes);
+        assert_eq!(quality_at(&measures, 10_000).clip, None, "it was not asked");
+        events.iter().for_each(|(at, state)| measures.clip(id(0), BEGIN + at * MS, *state));
+        let seconds = |ms: u64| ms as f64 / 1e3;
+        let (recorded, began) = (seconds(*recorded), began.map(seconds));
+        let expected = ClipQuality { recorded, began, refused: *refused, stopped: *stopped };
+        assert_eq!(quality_at(&measures, 10_000).clip, Some(expected), "{events:?}");
+    }
+    // Unplugged: it may have recorded on.
+    let mut measures = measures(ModalityKind::Bytes);
+    measures.plugged(id(0), BEGIN, true);
+    measures.clip(id(0), BEGIN, Recording);
+    measures.plugged(id(0), BEGIN + 4_000 * MS, false);
+    assert_eq!(quality_at(&measures, 10_000).clip.map(|clip| clip.recorded), Some(4.0));
 }
 
 #[test]
@@ -225,6 +265,7 @@ fn a_clock_at_another_rate_drifts_and_one_that_is_ahead_is_in_the_future() {
             let capture_ns = at.checked_add_signed(error).unwrap();
             let recv_ns = at + 20 * MS + n % 7 * jitter_ms * MS;
             let seen = SampleFacts {
+                again: false,
                 seq: n,
                 capture_ns,
                 recv_ns,
@@ -339,7 +380,7 @@ proptest! {
     fn no_sample_causes_a_panic(samples in prop::collection::vec(any::<(u64, u64, u64, bool)>(), 0..40), end in any::<u64>()) {
         let mut measures = measures(ModalityKind::Image);
         for (seq, capture_ns, recv_ns, cut) in &samples {
-            let seen = SampleFacts { seq: *seq, capture_ns: *capture_ns, recv_ns: *recv_ns, flagged: false, picture: if *cut { Judgement::NotWhole } else { Judgement::Usable }, payload: b"", repeated: None };
+            let seen = SampleFacts { again: false, seq: *seq, capture_ns: *capture_ns, recv_ns: *recv_ns, flagged: false, picture: if *cut { Judgement::NotWhole } else { Judgement::Usable }, payload: b"", repeated: None };
             measures.sample(id(0), &seen);
             measures.mask(*capture_ns, PhysicalMask(*seq));
             measures.missing(id(0), *seq, *recv_ns);

@@ -248,6 +248,55 @@ fn an_expected_sensor_is_judged_by_its_share_of_the_episode_and_an_absence_is_al
 }
 
 #[test]
+fn a_camera_that_did_not_record_by_itself_as_asked_is_not_good() {
+    use Grade::{Bad, Good, Suspect};
+    for (recorded, began, refused, stopped, grade, reason) in [
+        (9.0, Some(1.0), 0, 0, Good, ""),
+        (
+            7.9,
+            Some(2.1),
+            0,
+            0,
+            Suspect,
+            "cam: its own recording lacks 2.1 s of 10.0 s: it began after 2.1 s (limit 2.0 s)",
+        ),
+        (
+            9.5,
+            Some(0.5),
+            0,
+            1,
+            Suspect,
+            "cam: its own recording lacks 500 ms of 10.0 s: it began after 500 ms, stopped 1 time (limit 0)",
+        ),
+        (
+            1.0,
+            Some(4.0),
+            3,
+            2,
+            Suspect,
+            "cam: its own recording lacks 9.0 s of 10.0 s: it began after 4.0 s, refused 3 times, stopped 2 times (limit 2.0 s)",
+        ),
+        (0.0, None, 4, 0, Bad, "cam: recorded nothing by itself; it refused 4 times"),
+        // It was asked, and the episode ended before it answered.
+        (0.0, None, 0, 0, Bad, "cam: recorded nothing by itself; it refused 0 times"),
+    ] {
+        let quality = Quality { clip: Some(ClipQuality { recorded, began, refused, stopped }), ..good() };
+        // Its samples are others: without any it is judged, too.
+        for samples in [210, 0] {
+            let (talks, quality) = (good(), Quality { samples, present: 0.0, opening: 0.0, ..quality });
+            let modalities = [
+                Judged { name: "cam", quality: &quality, limits: limits().of_a_recorder() },
+                Judged { name: "tof", quality: &talks, limits: limits() },
+            ];
+            let verdict = judge(&facts(&modalities, FileState::Whole));
+            assert_eq!((verdict.grade, verdict.why().as_str()), (grade, reason));
+        }
+        let modalities = [Judged { name: "cam", quality: &quality, limits: limits() }];
+        assert_eq!(judge(&facts(&modalities, FileState::Whole)).grade, Good, "the check is off");
+    }
+}
+
+#[test]
 fn a_present_modality_without_samples_is_bad_and_an_absent_one_is_not_missed() {
     let silent = |present: f64| Quality { samples: 0, present, longest_gap: present, hz: Some(0.0), ..good() };
     let both = |quiet: &Quality| {
@@ -337,6 +386,7 @@ fn a_disabled_check_gives_no_reason() {
         opening: None,
         clock: None,
         uncertain: None,
+        clip: None,
         rate: None,
         valid: None,
         present: None,
@@ -355,6 +405,7 @@ fn a_disabled_check_gives_no_reason() {
         clock_drift: Some(999.0),
         clock_ahead: 999.0,
         clock_uncertainty: Some(999.0),
+        clip: Some(ClipQuality::default()),
         hz: Some(1.0),
         frames_missed: 500,
         ..good()

@@ -24,6 +24,21 @@ fn complaint(kind: ModalityKind, shape: &[u32], header: SampleHeader, payload: &
 }
 
 #[test]
+fn a_repeated_number_makes_duplicates_and_a_counter_that_restarts_does_not() {
+    let mut intake = intake(ModalityKind::Bytes, &[]);
+    for (seq, is_again, lost) in
+        [(0, false, 0), (0, true, 0), (0, true, 0), (1, false, 0), (4, false, 2), (4, true, 0), (0, false, 0)]
+    {
+        let header = SampleHeader { seq, capture_ns: 0, ..header(Encoding::Bytes) };
+        let judged = intake.judge(&header, b"x", NOW).expect("it is passed on");
+        assert_eq!((judged.flags & FLAG_SAME_NUMBER != 0, judged.lost), (is_again, lost), "{seq}");
+    }
+    let complaint = "samples are duplicates, of seq 0 again: a program must count its samples in seq";
+    assert_eq!(intake.complaint().as_deref(), Some(complaint));
+    assert_eq!(intake.complaint(), None, "reported once");
+}
+
+#[test]
 fn samples_that_contradict_the_entry_are_rejected_with_a_reason() {
     use Encoding::{Bytes, F64, Grey, Mjpeg, Yuyv};
     use ModalityKind::{Image, Scalars};
@@ -110,8 +125,8 @@ fn an_impossible_time_is_damaged_and_decides_for_its_sample_alone() {
         (106 * S + 1, 116 * S + 2, Damaged(106 * S + 2), false),
     ];
     let mut intake = intake(ModalityKind::Bytes, &[]);
-    for (capture_ns, now, expected, complains) in table {
-        let header = SampleHeader { capture_ns, flags: FLAG_DEVICE_TIME, ..header(Encoding::Bytes) };
+    for (seq, (capture_ns, now, expected, complains)) in (0..).zip(table) {
+        let header = SampleHeader { seq, capture_ns, flags: FLAG_DEVICE_TIME, ..header(Encoding::Bytes) };
         let judged = intake.judge(&header, b"", Stamp(now)).expect("a sample");
         let found = match judged.flags {
             0 if judged.captured.0 == now => Arrival,
@@ -135,8 +150,11 @@ fn a_capture_time_that_is_not_believed_is_named_with_the_fix() {
     ];
     for (capture_ns, doubt) in table {
         let mut intake = intake(ModalityKind::Bytes, &[]);
+        // Each has another number.
         let mut judge = |capture_ns| {
-            intake.judge(&SampleHeader { capture_ns, ..header(Encoding::Bytes) }, b"", NOW).expect("a sample");
+            intake
+                .judge(&SampleHeader { seq: capture_ns, capture_ns, ..header(Encoding::Bytes) }, b"", NOW)
+                .expect("a sample");
             intake.complaint()
         };
         assert_eq!(judge(NOW.0 - 5_000_000), None);
@@ -175,7 +193,7 @@ proptest! {
                 prop_assert!(header.id == 3 && header.epoch == 7);
                 prop_assert!(judged.captured <= Stamp(now) && judged.lost <= LARGEST_HOLE);
                 prop_assert!(judged.width <= 4 && judged.height <= 2);
-                prop_assert_eq!(judged.flags & !3, 0);
+                prop_assert_eq!(judged.flags & !7, 0);
                 // A later sample is never made an earlier one.
                 let is_damaged = judged.flags & FLAG_ERROR != 0;
                 prop_assert!(is_damaged || capture_ns == 0 || judged.captured == Stamp(capture_ns));

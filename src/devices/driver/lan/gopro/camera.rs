@@ -2,7 +2,7 @@
 //!
 //! The wanted state is the episode in progress, the actual state is the shutter in the [`Books`]. At every change and
 //! every keep-alive the actual state is adjusted to the wanted one: a missing answer or a lost connection causes only a
-//! delay.
+//! delay. A shutter that was refused, or stopped by itself, is started again, less and less often, while the episode lasts.
 //!
 //! An episode's clip is identified by the clip that was newest before its shutter was started. If that is not known, or
 //! clips of ours may not be listed yet, no clip is assigned to the episode.
@@ -14,6 +14,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use hyper::StatusCode;
+use rapid_core::clip::ClipState;
 use rapid_core::time::Stamp;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep};
@@ -24,7 +25,7 @@ use super::super::http;
 use super::answer::{self, Name, State};
 use super::clip::{self, Clip, Failure};
 use super::{ANSWER_LIMIT, Clips, LARGEST_ANSWER, TRIES, ask};
-use super::{Before, Books, Shutter};
+use super::{Before, Books, ClipReports, Shutter};
 use crate::driver::DriverError;
 
 /// The episode in progress, if there is one; `None` until the camera was notified.
@@ -48,6 +49,38 @@ impl TimeLimits {
     };
 }
 
+/// A shutter that was started runs after a moment: looks at the state, and the time between them.
+const STARTS: u32 = 5;
+const LOOK_FOR_START: Duration = Duration::from_millis(200);
+/// So many states in a row must report that the shutter does not run.
+const STATES: u32 = 2;
+/// The longest time between two tries, in keep-alives.
+const LONGEST_PAUSE: u32 = 10;
+
+/// When a shutter that does not run is started again: each time after twice the time.
+#[derive(Debug, Clone, Copy)]
+struct Retry {
+    due: Instant,
+    pause: Duration,
+    longest: Duration,
+}
+
+impl Retry {
+    fn new(keep_alive: Duration) -> Self {
+        Self { due: Instant::now(), pause: keep_alive, longest: keep_alive * LONGEST_PAUSE }
+    }
+
+    fn is_due(&self) -> bool {
+        Instant::now() >= self.due
+    }
+
+    /// A try begins.
+    fn count(&mut self) {
+        self.due = Instant::now() + self.pause;
+        self.pause = (self.pause * 2).min(self.longest);
+    }
+}
+
 const LOOK_FOR_CLIP: Duration = Duration::from_millis(100);
 
 #[derive(Debug)]
@@ -65,8 +98,14 @@ pub(super) struct Camera {
     unlisted: Option<(Shutter, Instant)>,
     /// Until then, clips of unknown episodes may appear in the list.
     unclear_until: Option<Instant>,
-    /// A refusal by the camera was reported.
+    /// That it does not stop was reported.
     is_stated: bool,
+    clips_report: ClipReports,
+    /// It was reported to record the episode in progress.
+    is_recording: bool,
+    /// States in a row by which the shutter does not run although it was started.
+    idle: u32,
+    retry: Retry,
     /// Clips that must still be fetched; the first is being fetched.
     pending: VecDeque<Clip>,
     fetching: Option<AbortOnDropHandle<Result<(), Failure>>>,
@@ -79,6 +118,7 @@ impl Camera {
         clips: Clips,
         books: Books,
         states: mpsc::Sender<Result<State, DriverError>>,
+        clips_report: ClipReports,
         limits: TimeLimits,
     ) -> Self {
         let mut camera = Self {
@@ -93,6 +133,10 @@ impl Camera {
             unlisted: None,
             unclear_until: None,
             is_stated: false,
+            clips_report,
+            is_recording: false,
+            idle: 0,
+            retry: Retry::new(limits.keep_alive),
             pending: VecDeque::new(),
             fetching: None,
         };
@@ -135,11 +179,14 @@ impl Camera {
                     }
                     self.wanted.clone_from(&reported.borrow_and_update());
                     self.is_stated = false;
+                    self.is_recording = false;
+                    self.retry = Retry::new(self.limits.keep_alive);
                     self.settle().await;
                 }
                 _ = ticks.tick() => {
                     let state = self.query_state().await;
                     let is_over = state.is_err();
+                    let recording = state.as_ref().ok().map(|state| state.recording);
                     if !self.states.is_closed() && self.states.try_send(state).is_err() {
                         tracing::debug!(device = self.name, "a state was not read in time");
                     }
@@ -149,6 +196,9 @@ impl Camera {
                     // The camera is notified of an episode in progress as soon as it is open.
                     if !std::mem::take(&mut is_first) {
                         self.wanted.get_or_insert(None);
+                    }
+                    if let Some(recording) = recording {
+                        self.watch_shutter(recording).await;
                     }
                     self.settle().await;
                 }
@@ -181,7 +231,11 @@ impl Camera {
             return;
         }
         match wanted {
-            Some(episode) if self.books.shutter().is_none() => self.start(episode).await,
+            Some(episode) if self.books.shutter().is_none() => {
+                if self.retry.is_due() {
+                    self.start(episode).await;
+                }
+            }
             Some(_) => {}
             None => {
                 self.list().await;
@@ -194,11 +248,60 @@ impl Camera {
     async fn has_inherited(&mut self) -> bool {
         let Ok(state) = self.query_state().await else { return false };
         self.is_inherited = false;
+        if state.recording && self.books.shutter().is_some_and(|shutter| self.is_wanted(shutter)) {
+            self.confirm();
+        }
         if let (Some(shutter), false) = (self.books.shutter().cloned(), state.recording) {
             self.unknown(&shutter, "its recording ended while it was not connected").await;
+            if self.is_wanted(&shutter) {
+                self.clips_report.send(ClipState::Stopped, "while it was not connected".to_owned());
+            }
             self.books.set_shutter(None).await;
         }
         true
+    }
+
+    /// Was the shutter started for the episode in progress?
+    fn is_wanted(&self, shutter: &Shutter) -> bool {
+        self.wanted.as_ref().is_some_and(|wanted| wanted.as_ref() == Some(&shutter.episode))
+    }
+
+    /// Compares the shutter that was started for the episode in progress with the camera's state. It takes a moment to
+    /// run: only what two states report is believed.
+    async fn watch_shutter(&mut self, recording: bool) {
+        let Some(shutter) = self.books.shutter().filter(|shutter| self.is_wanted(shutter)).cloned() else { return };
+        if self.is_inherited {
+            return;
+        }
+        if recording {
+            self.confirm();
+            return;
+        }
+        self.idle += 1;
+        if self.idle < STATES {
+            return;
+        }
+        let (state, text) = if std::mem::take(&mut self.is_recording) {
+            (ClipState::Stopped, "by itself")
+        } else {
+            (ClipState::Refused, "it accepted the order and does not record")
+        };
+        self.clips_report.send(state, text.to_owned());
+        self.idle = 0;
+        self.books.set_shutter(None).await;
+        // The part that it has is a clip of the episode.
+        if !matches!(shutter.before, Before::Unknown(_)) {
+            self.unlisted = Some((shutter, Instant::now() + self.limits.listed_at_the_latest));
+        }
+    }
+
+    /// The camera reports that it records the episode in progress.
+    fn confirm(&mut self) {
+        self.idle = 0;
+        self.retry = Retry::new(self.limits.keep_alive);
+        if !std::mem::replace(&mut self.is_recording, true) {
+            self.clips_report.send(ClipState::Recording, String::new());
+        }
     }
 
     async fn start(&mut self, episode: PathBuf) {
@@ -221,20 +324,23 @@ impl Camera {
             }
         };
         self.books.set_shutter(Some(Shutter { episode, before })).await;
-        let Err(error) = ask(&self.server, "/gopro/camera/shutter/start").await else {
-            if self.is_stated {
-                tracing::warn!(device = self.name, "records now, not from the beginning of the episode");
+        self.retry.count();
+        self.idle = 0;
+        let asked = ask(&self.server, "/gopro/camera/shutter/start").await;
+        // Despite an error it may be recording, started by hand.
+        for _ in 0..STARTS {
+            if self.query_state().await.is_ok_and(|state| state.recording) {
+                return self.confirm();
             }
-            return;
-        };
-        // It may already be recording, started by hand.
-        if self.query_state().await.is_ok_and(|state| state.recording) {
-            return;
+            if asked.is_err() {
+                break;
+            }
+            sleep(LOOK_FOR_START).await;
         }
+        // If the order was accepted, the next states tell.
+        let Err(error) = asked else { return };
         self.books.set_shutter(None).await;
-        if !std::mem::replace(&mut self.is_stated, true) {
-            tracing::error!(device = self.name, %error, "the camera does not record this episode; it is asked again");
-        }
+        self.clips_report.send(ClipState::Refused, error.to_string());
     }
 
     /// Stops the shutter and notes its clip; `false` if it keeps running.
@@ -294,6 +400,8 @@ impl Camera {
         let info = ask(&self.server, &format!("/gopro/media/info?path={}/{}", name.folder, name.file)).await;
         let size = info.ok().and_then(|info| answer::size(&info));
         let clip = Clip::new(name, size, episode, &self.name);
+        let mut clip = clip;
+        clip.is_further = is_further(&clip).await;
         let (noted, url) = (clip.clone(), clip.url(&self.server));
         let (Name { file, folder }, report) = (clip.name.clone(), url.clone());
         let written = tokio::task::spawn_blocking(move || noted.note(&url)).await;
@@ -374,6 +482,13 @@ async fn fetched(fetching: &mut Option<AbortOnDropHandle<Result<(), Failure>>>) 
         Some(fetching) => fetching.await.unwrap_or_else(|error| Err(Failure::Stays(error.to_string()))),
         None => std::future::pending().await,
     }
+}
+
+/// Does the episode have another clip already? The shutter was started again in it.
+async fn is_further(clip: &Clip) -> bool {
+    let (note, name) = (clip.note_path(), clip.name.clone());
+    let there = tokio::task::spawn_blocking(move || Clip::of_note(&note)).await;
+    there.ok().flatten().is_some_and(|there| there.name != name)
 }
 
 /// The newest clip on the card; `None` if there is none.

@@ -1,6 +1,7 @@
 //! A clip that a camera recorded during an episode: noted beside the episode's file, and fetched.
 //!
-//! Beside `NAME.mcap` the note is `NAME.DEVICE.clip.json` and the clip `NAME.DEVICE.FILE`; while the clip is being
+//! Beside `NAME.mcap` the note is `NAME.DEVICE.clip.json` (of a further clip of the same episode
+//! `NAME.DEVICE.FILE.clip.json`) and the clip `NAME.DEVICE.FILE`; while the clip is being
 //! fetched its name ends in `.partial`, and a partial file is continued.
 //!
 //! Invariant: strings from the camera become part of a path only if they are plain names.
@@ -43,6 +44,8 @@ pub(super) struct Clip {
     pub(super) size: Option<u64>,
     pub(super) episode: PathBuf,
     device: String,
+    /// The episode has a clip before it: the shutter was started again.
+    pub(super) is_further: bool,
 }
 
 /// Why a clip was not fetched.
@@ -56,7 +59,7 @@ pub(super) enum Failure {
 
 impl Clip {
     pub(super) fn new(name: Name, size: Option<u64>, episode: PathBuf, device: &str) -> Self {
-        Self { name, size, episode, device: device.to_owned() }
+        Self { name, size, episode, device: device.to_owned(), is_further: false }
     }
 
     /// The clip described by the note at this path; `None` if it is not one of our notes.
@@ -66,14 +69,17 @@ impl Clip {
     }
 
     pub(super) fn read(path: &Path, text: &str) -> Option<Self> {
-        let note: serde_json::Value = serde_json::from_str(text).ok()?;
-        let plain = |key: &str| Some(note.get(key)?.as_str().filter(|name| is_plain(name))?.to_owned());
+        let written: serde_json::Value = serde_json::from_str(text).ok()?;
+        let plain = |key: &str| Some(written.get(key)?.as_str().filter(|name| is_plain(name))?.to_owned());
         let device = plain("device")?;
-        let stem = path.file_name()?.to_str()?.strip_suffix(&format!(".{device}.clip.json"))?;
-        let episode = path.with_file_name(format!("{stem}.mcap"));
         let name = Name { folder: plain("folder")?, file: plain("file")? };
-        let size = note.get("size").and_then(serde_json::Value::as_u64);
-        (!stem.is_empty()).then_some(Self { name, size, episode, device })
+        let note = |what: &str| path.file_name()?.to_str()?.strip_suffix(&format!(".{what}.clip.json"));
+        let further = note(&format!("{device}.{}", name.file));
+        let is_further = further.is_some();
+        let stem = further.or_else(|| note(&device))?;
+        let episode = path.with_file_name(format!("{stem}.mcap"));
+        let size = written.get("size").and_then(serde_json::Value::as_u64);
+        (!stem.is_empty()).then_some(Self { name, size, episode, device, is_further })
     }
 
     fn path(&self) -> String {
@@ -95,7 +101,7 @@ impl Clip {
     }
 
     pub(super) fn note_path(&self) -> PathBuf {
-        self.beside("clip.json")
+        if self.is_further { self.beside(&format!("{}.clip.json", self.name.file)) } else { self.beside("clip.json") }
     }
 
     /// Writes the note.

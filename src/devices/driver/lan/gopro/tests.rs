@@ -185,6 +185,9 @@ struct Fake {
     listed: AtomicUsize,
     /// A clip is listed as soon as it is made.
     lists: AtomicBool,
+    /// It does not record: it refuses the order, or accepts it only.
+    refuses: AtomicBool,
+    pretends: AtomicBool,
     /// Requests that contain this word get no answer.
     deaf: Mutex<Option<&'static str>>,
 }
@@ -223,6 +226,8 @@ impl Fake {
             "/gopro/camera/state" => {
                 format!(r#"{{"status":{{"10":{}}}}}"#, u8::from(self.recording.load(Ordering::Relaxed))).into_bytes()
             }
+            "/gopro/camera/shutter/start" if self.refuses.load(Ordering::Relaxed) => return Some((403, Vec::new())),
+            "/gopro/camera/shutter/start" if self.pretends.load(Ordering::Relaxed) => Vec::new(),
             "/gopro/camera/shutter/start" => {
                 self.recording.store(true, Ordering::Relaxed);
                 Vec::new()
@@ -282,13 +287,16 @@ struct Bench {
     server: Server,
     gopro: Option<Gopro>,
     download: bool,
+    /// What was reported of its own recording.
+    reported: Vec<ClipState>,
+    clips: Option<mpsc::Receiver<ClipNotice>>,
 }
 
 impl Bench {
     async fn new(download: bool) -> Self {
         let (fake, server) = Fake::start().await;
         let folder = tempfile::tempdir().expect("a folder");
-        let mut bench = Self { folder, fake, server, gopro: None, download };
+        let mut bench = Self { folder, fake, server, gopro: None, download, reported: Vec::new(), clips: None };
         bench.open().await;
         bench
     }
@@ -300,7 +308,9 @@ impl Bench {
         let gopro =
             Gopro::begin("gopro", self.server.clone(), Clips { download: self.download, reserve: None }, state, QUICK)
                 .await;
-        self.gopro = Some(gopro.expect("open"));
+        let mut gopro = gopro.expect("open");
+        self.clips = gopro.clips();
+        self.gopro = Some(gopro);
     }
 
     async fn close(&mut self) {
@@ -333,6 +343,9 @@ impl Bench {
             assert!(begun.elapsed() < PATIENCE, "{what}: {asked:?}; {}", self.books());
             if let Some(gopro) = &mut self.gopro {
                 let _ = tokio::time::timeout(Duration::from_millis(10), gopro.read()).await;
+            }
+            while let Some(Ok(clip)) = self.clips.as_mut().map(mpsc::Receiver::try_recv) {
+                self.reported.push(clip.state);
             }
             sleep(Duration::from_millis(5)).await;
         }
@@ -416,6 +429,49 @@ async fn a_shutter_that_does_not_answer_is_asked_again() {
     bench.until("asked twice", |bench| bench.fake.asked("shutter/stop") >= 2 * TRIES as usize).await;
     bench.fake.ignore_requests(None);
     bench.until("a note", |bench| bench.clip_of("one").is_some()).await;
+}
+
+#[tokio::test]
+async fn a_refused_shutter_is_reported_and_asked_again_until_it_runs() {
+    for pretends in [false, true] {
+        let mut bench = Bench::new(false).await;
+        let refuse = |bench: &Bench, refuses: bool| {
+            let how = if pretends { &bench.fake.pretends } else { &bench.fake.refuses };
+            how.store(refuses, Ordering::Relaxed);
+        };
+        refuse(&bench, true);
+        bench.record(Some("one"));
+        let is = |state: ClipState| move |bench: &Bench| bench.reported.last() == Some(&state);
+        bench.until("refused", is(ClipState::Refused)).await;
+        assert_eq!(bench.reported[..2], [ClipState::Asked, ClipState::Refused]);
+        bench.until("asked again", |bench| bench.fake.asked("shutter/start") >= 3).await;
+        refuse(&bench, false);
+        bench.until("recording", is(ClipState::Recording)).await;
+        assert!(bench.fake.is_recording());
+        // An episode of its own begins anew.
+        bench.record(Some("two"));
+        bench.until("recording", |bench| bench.reported.ends_with(&[ClipState::Asked, ClipState::Recording])).await;
+    }
+}
+
+#[tokio::test]
+async fn a_shutter_that_stops_by_itself_is_reported_and_started_again_and_both_clips_are_noted() {
+    let mut bench = Bench::new(false).await;
+    bench.record(Some("one"));
+    bench.until("recording", |bench| bench.reported == [ClipState::Asked, ClipState::Recording]).await;
+    // The battery was changed, the card was full for a moment, a person pressed the button.
+    bench.fake.recording.store(false, Ordering::Relaxed);
+    bench.fake.made();
+    bench.until("recording again", |bench| bench.reported.len() == 4).await;
+    assert_eq!(bench.reported[2..], [ClipState::Stopped, ClipState::Recording]);
+    assert!(bench.fake.is_recording());
+    bench.record(None);
+    let second = bench.path("one.gopro.GX010002.MP4.clip.json");
+    bench.until("the second note", |_| second.exists()).await;
+    assert_eq!(bench.clip_of("one").as_deref(), Some("GX010001.MP4"));
+    let clip = Clip::of_note(&second).expect("a note");
+    assert_eq!((clip.name, clip.episode), (named(2), bench.path("one.mcap")));
+    bench.close().await;
 }
 
 #[tokio::test]
