@@ -6,6 +6,7 @@
 mod export;
 mod list;
 mod measure;
+mod notes;
 mod policy;
 mod registry;
 mod run;
@@ -25,6 +26,7 @@ use rapid_registry::units::parse_duration;
 pub use export::{ExportArgs, Layout, PictureForm};
 pub use list::{LabelFilter, ListArgs, SortArg, VerdictArg};
 pub use measure::{AblationArgs, Calibration, Count, LatencyArgs};
+pub use notes::LabelArgs;
 #[cfg(feature = "policy")]
 pub use policy::{EvalArgs, ObserveArgs, PolicyCommand, ShowArgs};
 pub use policy::{InferenceArgs, PolicyArgs, ReplayArgs};
@@ -175,7 +177,7 @@ fn general_options(command: &str) -> &'static [&'static str] {
         "artifacts" => &["config"],
         "mask" | "replay" | "episode" | "session" | "reload" | "logs" => &["json", "instance"],
         "arm" | "disarm" | "monitor" => &["instance"],
-        "inspect" | "list" | "recover" | "eval" | "export" => &["json"],
+        "inspect" | "label" | "list" | "recover" | "eval" | "export" => &["json"],
         _ => &[],
     }
 }
@@ -325,6 +327,9 @@ pub enum Command {
         #[arg(long, value_name = "SVG|DIR|-", num_args = 0..=1, require_equals = true, value_hint = ValueHint::AnyPath)]
         plot: Option<Option<PathBuf>>,
     },
+    /// Label an episode of any folder, attach a note, mark moments
+    #[command(after_long_help = notes::LABEL)]
+    Label(LabelArgs),
     /// List episodes by verdict, label, task, tag, sensor or date
     #[command(after_long_help = list::LIST)]
     List(ListArgs),
@@ -358,8 +363,11 @@ pub enum Command {
     #[command(after_long_help = measure::ABLATION)]
     Ablation(AblationArgs),
     /// Print a shell completion script
-    #[command(after_long_help = "Examples:\n  source <(rapid completions bash)\n  \
-        rapid completions fish >~/.config/fish/completions/rapid.fish")]
+    #[command(
+        hide = true,
+        after_long_help = "Examples:\n  source <(rapid completions bash)\n  \
+        rapid completions fish >~/.config/fish/completions/rapid.fish"
+    )]
     Completions {
         /// Shell
         shell: clap_complete::Shell,

@@ -42,6 +42,7 @@ use crate::commands::devices::Formats;
 use crate::commands::inspect::InspectFailure;
 use crate::commands::logs::LogsOptions;
 use crate::commands::mask::MaskOptions;
+use crate::commands::notes::NoteError;
 use crate::commands::{self, CommandStatus, Format};
 use crate::rig::presence::{self, PresenceError, json_path, read_mask};
 use crate::session::journal::Plan;
@@ -184,6 +185,7 @@ fn execute(cli: Cli) -> Result<(), Failure> {
             let palette = Palette::for_output(&io::stdout());
             reported(commands::inspect::inspect(&paths, format, columns, palette, out)?)
         }
+        Command::Label(args) => Ok(commands::notes::note(&args.file, &args.changes(), format, out)?),
         Command::List(args) => {
             let palette = Palette::for_output(&io::stdout());
             reported(commands::list::list(&args, format, palette, out, &mut |error| {
@@ -568,6 +570,10 @@ failures! {
     commands::register::RegisterError: |error| argument_code(error.is_bad_argument());
     commands::modules::ModulesError: |error| argument_code(!matches!(error, commands::modules::ModulesError::Output(_)));
     commands::session::RequestError: |_| 1;
+    commands::notes::NoteError: |error| {
+        let is_argument = matches!(error, NoteError::NoEpisode(_) | NoteError::Beyond { .. } | NoteError::Nothing);
+        if is_argument { 2 } else { 1 }
+    };
     commands::logs::LogsError: |error| match error {
         commands::logs::LogsError::NoDevice { .. } => 2,
         commands::logs::LogsError::Monitor(_) | commands::logs::LogsError::Output(_) => 1,

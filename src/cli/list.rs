@@ -97,6 +97,15 @@ pub enum LabelFilter {
 }
 
 impl LabelFilter {
+    /// The label.
+    pub const fn label(self) -> Option<Label> {
+        match self {
+            Self::Success => Some(Label::Success),
+            Self::Failure => Some(Label::Failure),
+            Self::None => None,
+        }
+    }
+
     /// The word for what an episode has.
     pub const fn of(label: Option<Label>) -> Self {
         match label {

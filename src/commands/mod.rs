@@ -22,6 +22,7 @@ pub mod logs;
 pub mod mask;
 pub mod modules;
 pub mod monitor;
+pub mod notes;
 pub mod plot;
 #[cfg(feature = "policy")]
 pub mod policy;

@@ -47,10 +47,11 @@ pub fn ask(
 /// # Errors
 /// When no run accepts requests, or it takes over nothing because something else was changed.
 pub fn reload(instance: Option<&str>, format: Format, out: &mut dyn Write) -> Result<(), RequestError> {
-    done(&request(instance, &RegistryRequest::Reload)?, format, out)
+    Ok(done(&request(instance, &RegistryRequest::Reload)?, format, out)?)
 }
 
-fn done(answer: &str, format: Format, out: &mut dyn Write) -> Result<(), RequestError> {
+/// Prints what was done.
+pub(super) fn done(answer: &str, format: Format, out: &mut dyn Write) -> io::Result<()> {
     match format {
         Format::Json => writeln!(out, "{}", super::json_line("answer", &serde_json::json!({ "done": answer }))?)?,
         Format::Text => writeln!(out, "{}", text::plain(answer))?,

@@ -63,6 +63,7 @@ use std::io;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
+use rapid_system::limited::{Hole, large_hole};
 use rustix::fs::OFlags;
 
 /// Metadata record at an episode's beginning.
@@ -109,11 +110,17 @@ pub enum ReadError {
     NotMcap(PathBuf),
 }
 
+/// A hole in a file is within a record, as a copy makes it of black pictures: it is not longer than the longest record that is
+/// read. Reading zeros takes time for nothing, so there are not many of them: for any file, and per byte that was written.
+const LONGEST_HOLE: u64 = framing::MAX_RECORD;
+const MOST_HOLES: u64 = 4 << 30;
+const HOLES_EACH: u64 = 64;
+
 /// Opens a file to be read, and its size in bytes. Pipes, devices and folders are refused without
 /// being opened: opening one may block forever or have side effects.
 ///
 /// # Errors
-/// There is no such file, or it is not a file.
+/// There is no such file, it is not a file, or much of it was never written.
 pub fn open(path: &Path) -> Result<(File, u64), ReadError> {
     let io = |source| ReadError::Io { path: path.to_owned(), source };
     let not_file = || ReadError::NotFile(path.to_owned());
@@ -124,5 +131,16 @@ pub fn open(path: &Path) -> Result<(File, u64), ReadError> {
     let file = File::options().read(true).custom_flags(flags).open(path).map_err(io)?;
     // The name may mean something else than a moment ago.
     let metadata = file.metadata().map_err(io)?;
-    if metadata.is_file() { Ok((file, metadata.len())) } else { Err(not_file()) }
+    if !metadata.is_file() {
+        return Err(not_file());
+    }
+    let size = metadata.len();
+    match large_hole(&file, size, LONGEST_HOLE, MOST_HOLES, HOLES_EACH) {
+        Some(Hole { at, bytes }) => Err(io(io::Error::other(format!(
+            "{} from byte {at} on were never written (a sparse file): it is not as it was recorded; copy it again from where \
+             it came from",
+            rapid_core::text::size(bytes)
+        )))),
+        None => Ok((file, size)),
+    }
 }

@@ -141,3 +141,6 @@ fn write(folder: &Folder, name: &Path, notes: &Notes) -> Result<(), NotesError> 
     let _ = folder.sync();
     Ok(())
 }
+
+#[cfg(test)]
+mod tests;

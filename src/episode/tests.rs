@@ -177,3 +177,61 @@ fn mutated_bytes_never_panic() {
         });
     }
 }
+
+#[test]
+fn files_that_were_hardly_written_are_refused_before_they_are_read() {
+    use std::os::unix::fs::FileExt as _;
+    const TERABYTES: u64 = 4 << 40;
+    let folder = tempfile::tempdir_in(".").unwrap();
+    let whole = episode(layouts().into_iter().next().unwrap());
+    let large = |opcode: u8, content: &[u8]| [&[opcode][..], &(TERABYTES - 1000).to_le_bytes(), content].concat();
+    let begins = [
+        ("nothing", Vec::new()),
+        ("magic", MAGIC.to_vec()),
+        ("an episode", whole),
+        ("a private record", file(&[large(0x80, b"")])),
+        ("an attachment", file(&[large(op::ATTACHMENT, &[0; 30])])),
+        ("a chunk", file(&[large(op::CHUNK, &[0; 40])])),
+    ];
+    for (what, begin) in begins {
+        for end in [Vec::new(), MAGIC.to_vec()] {
+            let path = folder.path().join(format!("{what}.mcap.partial"));
+            let written = std::fs::File::create(&path).unwrap();
+            written.write_all_at(&begin, 0).unwrap();
+            written.set_len(TERABYTES).unwrap();
+            written.write_all_at(&end, TERABYTES).unwrap();
+            drop(written);
+            let listed = crate::record::inspect::list(&path).error.unwrap_or_default();
+            let errors = [
+                listed,
+                crate::sha256(&path).unwrap_err().to_string(),
+                crate::recover::recover(&path, &mut |_, _| std::ops::ControlFlow::Continue(()))
+                    .unwrap_err()
+                    .to_string(),
+                crate::recover::is_damaged(&path, &mut |_, _| std::ops::ControlFlow::Continue(()))
+                    .unwrap_err()
+                    .to_string(),
+            ];
+            for error in errors {
+                assert!(error.contains("were never written (a sparse file)"), "{what}: {error}");
+            }
+            std::fs::remove_file(&path).unwrap();
+        }
+    }
+}
+
+#[test]
+fn an_episode_with_holes_in_it_is_read_like_any_other() {
+    use std::os::unix::fs::FileExt as _;
+    let folder = tempfile::tempdir_in(".").unwrap();
+    // A record of zeros, as `cp --sparse=always` writes it.
+    let mut bytes = episode(layouts().into_iter().next().unwrap());
+    let end = bytes.split_off(MAGIC.len());
+    let (path, black) = (folder.path().join("holes.mcap"), 8_u64 << 20);
+    let written = std::fs::File::create(&path).unwrap();
+    let head = [&MAGIC[..], &[0x80], &black.to_le_bytes()].concat();
+    written.write_all_at(&head, 0).unwrap();
+    written.write_all_at(&end, head.len() as u64 + black).unwrap();
+    drop(written);
+    assert_eq!(crate::record::inspect::list(&path).error, None);
+}

@@ -7,13 +7,14 @@
 
 use std::cell::RefCell;
 use std::fs::{File, OpenOptions};
-use std::io::{ErrorKind, Read};
+use std::io::ErrorKind;
 use std::ops::RangeInclusive;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::sync::LazyLock;
 use std::time::Duration;
 
+use rapid_system::limited::read_bytes;
 use toml::Spanned;
 use toml::de::{DeInteger, DeTable, DeValue};
 
@@ -497,7 +498,7 @@ pub fn read_file(path: &Path, when_missing: &str) -> Result<String, RegistryErro
     let problem = |message: String, fix: String| RegistryErrors::whole_file(label.clone(), message, fix);
     // Without waiting: opening a named pipe would wait for its writer.
     let opened = OpenOptions::new().read(true).custom_flags(libc::O_NONBLOCK | libc::O_NOCTTY).open(path);
-    let mut file: File = opened.map_err(|error| match error.kind() {
+    let file: File = opened.map_err(|error| match error.kind() {
         ErrorKind::NotFound => problem("there is no such file".to_owned(), when_missing.to_owned()),
         ErrorKind::PermissionDenied => problem(
             "it may not be read by this user".to_owned(),
@@ -520,11 +521,7 @@ pub fn read_file(path: &Path, when_missing: &str) -> Result<String, RegistryErro
     {
         return Err(problem(reason.to_string(), reason.fix()));
     }
-    let mut bytes = Vec::new();
-    file.by_ref().take(LARGEST + 1).read_to_end(&mut bytes).map_err(cannot_read)?;
-    if bytes.len() as u64 > LARGEST {
-        return Err(problem("it is larger than 1MiB".to_owned(), "is it the right file?".to_owned()));
-    }
+    let bytes = read_bytes(&file, LARGEST).map_err(cannot_read)?;
     String::from_utf8(bytes).map_err(|error| {
         let line = error.as_bytes().iter().take(error.utf8_error().valid_up_to()).filter(|b| **b == b'\n').count() + 1;
         let bytes = error.as_bytes();
@@ -551,7 +548,7 @@ mod tests {
         std::fs::write(&path, b"a = 1\nb = \"\xff\"\n").unwrap();
         assert!(message(&path).contains("it is not UTF-8 text (line 2)"), "{}", message(&path));
         std::fs::write(&path, vec![b'#'; 1 + (1 << 20)]).unwrap();
-        assert!(message(&path).contains("larger than 1MiB"));
+        assert!(message(&path).contains("larger than 1.0 MB"), "{}", message(&path));
         std::fs::write(&path, "a = 1\n").unwrap();
         assert_eq!(read_file(&path, "").unwrap(), "a = 1\n");
         std::fs::set_permissions(&path, std::os::unix::fs::PermissionsExt::from_mode(0o666)).unwrap();

@@ -26,8 +26,8 @@ use super::trash;
 
 /// The name of the file of a session in progress.
 const CURRENT: &str = "session.toml";
-/// A file of a million episodes is smaller; a larger one is not ours.
-const LARGEST: u64 = 1 << 28;
+/// A file of a hundred thousand episodes is smaller; a larger one is not ours.
+const LARGEST: u64 = 1 << 26;
 /// For people who open it.
 const HEAD: &str = "# A session of rapid. Written at each change while it lasts; edit it only when it has ended.\n";
 
@@ -86,6 +86,13 @@ impl SessionFile {
             let is_here = folder.has(&episode.file);
             let is_in_trash = trash::holds(folder, &episode.file);
             episode.discarded = was_discarded(episode.discarded, is_here, is_in_trash);
+        }
+        self.take_notes(folder);
+    }
+
+    /// Takes over what is noted beside its episodes: other programs may have noted it.
+    fn take_notes(&mut self, folder: &Folder) {
+        for episode in &mut self.episodes {
             match notes::read(folder, episode.file.as_ref()) {
                 Ok(Some(notes)) => episode.set_notes(notes),
                 Ok(None) => {}
@@ -378,6 +385,7 @@ impl Journal {
     /// # Errors
     /// When the disk does not accept it.
     pub fn summarise(&mut self, file: &SessionFile) -> Result<(), JournalError> {
+        let mut file = file.clone();
         let name = format!("session-{}.md", compact(&file.begun));
         let path = self.path.join(&name);
         let io = |source| JournalError::Io { path, source };
@@ -385,7 +393,8 @@ impl Journal {
             Ok(folder) => folder,
             Err(error) => return Err(io(error.into())),
         };
-        folder.replace_by_umask(&name, super::markdown(file).as_bytes(), Sync::Wait).map_err(io)
+        file.take_notes(folder);
+        folder.replace_by_umask(&name, super::markdown(&file).as_bytes(), Sync::Wait).map_err(io)
     }
 
     /// Gives the file, which is saved, its final contents and name, and writes the summary.
@@ -411,8 +420,10 @@ impl Journal {
 
     fn write_final(&self, file: &SessionFile) -> Result<(), JournalError> {
         let io = |source| JournalError::Io { path: self.path.join(&self.name), source };
-        let text = toml::to_string(file).map_err(|error| io(io::Error::other(error)))?;
         let folder = self.folder.as_ref().ok_or_else(|| io(io::ErrorKind::NotFound.into()))?;
+        let mut file = file.clone();
+        file.take_notes(folder);
+        let text = toml::to_string(&file).map_err(|error| io(io::Error::other(error)))?;
         folder.replace_by_umask(&self.name, format!("{HEAD}{text}").as_bytes(), Sync::Wait).map_err(io)?;
         let _ = folder.sync();
         Ok(())
@@ -605,6 +616,37 @@ mod tests {
         assert!(error.is_none(), "{error:?}");
         assert_eq!(read.unwrap(), file);
         insta::assert_snapshot!(std::fs::read_to_string(folder.path().join("session.toml")).unwrap());
+    }
+
+    #[test]
+    fn no_length_of_a_session_is_impossible_and_no_file_endless() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut journal, ..) = Journal::open(folder.path(), "place block");
+        journal.save(&session(vec![entry("20261124_place-block_001.mcap")])).unwrap();
+        let path = folder.path().join("session.toml");
+        let written = std::fs::read_to_string(&path).unwrap();
+        for (was, key) in [("seconds = 29.8", "seconds"), ("at = 12.5", "at"), ("at = 13.0", "at")] {
+            assert!(written.contains(was), "{written}");
+            for number in ["inf", "-inf", "nan", "1e300", "-1.0", "1e18"] {
+                let text = written.replace(was, &format!("{key} = {number}"));
+                std::fs::write(&path, text).unwrap();
+                let (read, errors) = sessions(folder.path());
+                // What is shown of each.
+                for file in &read {
+                    crate::session::markdown(file);
+                }
+                let error = errors.first().map(ToString::to_string).unwrap_or_default();
+                assert!(error.contains(": line ") && error.contains("no time in seconds"), "{number}: {error}");
+            }
+        }
+        for inside in ["[".repeat(500_000), "{a=".repeat(300_000), format!("1\n{}=1", "a.".repeat(400_000))] {
+            std::fs::write(&path, format!("begun = {inside}")).unwrap();
+            assert_eq!(sessions(folder.path()).1.len(), 1);
+        }
+        std::fs::write(&path, written).unwrap();
+        std::fs::File::options().write(true).open(&path).unwrap().set_len(1 << 40).unwrap();
+        let error = sessions(folder.path()).1.remove(0).to_string();
+        assert!(error.contains("larger than 67.1 MB"), "{error}");
     }
 
     #[test]

@@ -13,6 +13,7 @@ use rapid_status::session::{Notes, NotesChange};
 use rapid_system::folder::{Folder, FolderError, Links, Missing};
 
 use super::journal::{self, JournalError};
+use super::{LONGEST_TEXT, Refusal};
 
 /// Why it is not known what was noted, or it cannot be changed.
 #[derive(Debug, thiserror::Error)]
@@ -26,6 +27,9 @@ pub enum NotedError {
     /// The folder.
     #[error(transparent)]
     Folder(#[from] FolderError),
+    /// A text is too long.
+    #[error(transparent)]
+    TooLong(Refusal),
 }
 
 /// Label, note and marks of each of these files about which something is noted. `warn` gets what could not be read.
@@ -63,6 +67,10 @@ pub fn noted(files: &[PathBuf], warn: &mut dyn FnMut(&NotedError)) -> BTreeMap<P
 /// # Errors
 /// When what is noted cannot be read or written; nothing has changed then.
 pub fn change(file: &Path, changes: &[NotesChange]) -> Result<Notes, NotedError> {
+    let is_long = |change: &NotesChange| change.text().len() > LONGEST_TEXT;
+    if changes.iter().any(is_long) {
+        return Err(NotedError::TooLong(Refusal::TooLong));
+    }
     let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let open = Folder::open(folder, Links::Own, Missing::Refused)?;
     let name = finished_name(file);

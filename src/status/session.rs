@@ -200,8 +200,17 @@ pub enum NotesChange {
     Mark(Mark),
 }
 
+impl NotesChange {
+    /// What somebody wrote.
+    pub fn text(&self) -> &str {
+        match self {
+            Self::Label(_, text) | Self::Note(text) | Self::Mark(Mark { text, .. }) => text,
+        }
+    }
+}
+
 /// Longest time within an episode, or length of one, in seconds: some 30 years. A longer one is a mistake.
-const LONGEST: f64 = 1e9;
+pub const LONGEST: f64 = 1e9;
 
 /// A time in seconds that a computation can rely on.
 fn seconds<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {

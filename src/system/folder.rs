@@ -10,7 +10,7 @@
 
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
-use std::io::{self, Read, Write};
+use std::io::{self, Write};
 use std::os::fd::{AsFd, AsRawFd, OwnedFd};
 use std::os::unix::ffi::OsStringExt;
 use std::path::{Component, Path, PathBuf};
@@ -19,6 +19,7 @@ use rapid_core::time::realtime_ns;
 use rustix::fs::{AtFlags, CWD, FileType, Mode, OFlags, RenameFlags, Stat};
 use rustix::io::Errno;
 
+use super::limited;
 use crate::fault;
 
 /// Links on one path before it is taken for a loop; as in Linux, see `path_resolution(7)`.
@@ -323,17 +324,15 @@ pub enum Sync {
     Skip,
 }
 
-/// The text of an ordinary file at `path`, at most `limit` bytes of it: for files that other users may
+/// The text of an ordinary file at `path`, of at most `limit` bytes: for files that other users may
 /// have planted.
 ///
 /// # Errors
-/// When it does not exist, is not an ordinary file, or is not UTF-8.
+/// When it does not exist, is not an ordinary file, is larger, or is not UTF-8.
 pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     let folder = path.parent().filter(|folder| *folder != Path::new("")).unwrap_or(Path::new("."));
     let folder = Folder::open(folder, Links::Own, Missing::Refused).map_err(io::Error::other)?;
-    let mut text = String::new();
-    folder.open_file(path.file_name().unwrap_or_default())?.take(limit).read_to_string(&mut text)?;
-    Ok(text)
+    limited::read_text(&folder.open_file(path.file_name().unwrap_or_default())?, limit)
 }
 
 /// A walk along a path, one part at a time: each is opened in the one before, so that nothing on the way can be

@@ -1,5 +1,5 @@
 //! What several parts of `rapid` ask of the operating system: folders that others may write to, free space of a
-//! disk, ports that are held, lines of GPIO, the scheduling of threads, who is at the other end of a socket, output that
+//! disk, reads that are bounded, ports that are held, lines of GPIO, the scheduling of threads, who is at the other end of a socket, output that
 //! blocks its own thread alone, and what is reported of a panic.
 //!
 //! Invariant: nothing here knows a device, an episode or a configuration.
@@ -8,6 +8,7 @@ pub mod disk;
 pub mod fault;
 pub mod folder;
 pub mod gpio;
+pub mod limited;
 pub mod outlet;
 pub mod panics;
 pub mod peer;

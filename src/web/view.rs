@@ -28,9 +28,10 @@ pub(super) struct View<'a> {
     begins_in: Option<u64>,
     recording: Option<Recording>,
     not_started: Option<&'a str>,
-    /// The episode in progress, then the last one that is closed and kept.
+    /// The episode in progress.
     current: Option<&'a str>,
-    last: Option<&'a EpisodeEntry>,
+    /// The episode that is shown, and that labels and discards are about: the one in progress, or the last that is kept.
+    about: Option<&'a EpisodeEntry>,
     session: Option<Progress<'a>>,
     disk_free: Option<String>,
     /// The newest first.
@@ -96,7 +97,7 @@ impl<'a> View<'a> {
             recording: snapshot.recording.as_ref().map(recording),
             not_started: snapshot.not_started.as_deref(),
             current: current.map(|entry| &*entry.file),
-            last: session.and_then(last),
+            about: current.or_else(|| session.and_then(last)),
             session: session.map(progress),
             disk_free: snapshot.disk_free.map(text::size),
             warnings: warnings
@@ -218,7 +219,12 @@ mod tests {
         let finding = Finding { grade: Grade::Suspect, modality: Some("tof".to_owned()), text: "late".to_owned() };
         snapshot.recording = Some(RecordingStatus { outlook: Outlook { findings: vec![finding] }, ..recording(0) });
         let view = shown(&snapshot);
-        assert_eq!((&view["current"], &view["last"]["file"]), (&"a_003.mcap".into(), &"a_001.mcap".into()));
+        assert_eq!((&view["current"], &view["about"]["file"]), (&"a_003.mcap".into(), &"a_003.mcap".into()));
+        // Once it has ended in the trash, the last that is kept is shown.
+        let session = snapshot.session.as_mut().unwrap();
+        (session.phase, session.episodes[2].discarded) = (Phase::Idle, true);
+        let idle = shown(&snapshot);
+        assert_eq!((&idle["current"], &idle["about"]["file"]), (&serde_json::Value::Null, &"a_001.mcap".into()));
         assert_eq!(
             (&view["recording"]["verdict"], &view["recording"]["reasons"][0]),
             (&"SUSPECT".into(), &"tof: late".into())

@@ -174,7 +174,7 @@ def check(rapid, page, place, shots):
     page.shot(shots, "unplugged")
     until("it is back", lambda: page.value(pictures) == 2)
     page.press("#toggle")
-    until("it has ended", lambda: page.text("#now") == "Idle" and page.text("#last-verdict"))
+    until("it has ended", lambda: page.text("#now") == "Idle" and page.text("#about-verdict"))
     page.press("#success")
     until("it is labelled", lambda: page.value("document.querySelector('#success').classList.contains('chosen')"))
     page.shot(shots, "ended")
@@ -186,11 +186,11 @@ def check(rapid, page, place, shots):
     until("it asks no longer", lambda: page.text("#discard") == "Discard last")
     page.press("#discard")
     until("it asks", lambda: page.text("#discard") == "Really discard")
-    assert page.text("#last-file")
+    assert page.text("#about-file")
     page.press("#discard")
-    until("it is in the trash", lambda: page.value("document.querySelector('#last').hidden"))
+    until("it is in the trash", lambda: page.value("document.querySelector('#about').hidden"))
     page.press("#undo")
-    until("it is back", lambda: not page.value("document.querySelector('#last').hidden"))
+    until("it is back", lambda: not page.value("document.querySelector('#about').hidden"))
 
     # The network is away while everything seems to be connected: nothing is shown as if it were current.
     run.process.send_signal(signal.SIGSTOP)

@@ -37,6 +37,7 @@ mod list;
 mod many_devices;
 mod modules;
 mod nodes;
+mod notes;
 mod observe;
 mod old_files;
 mod plot;

@@ -142,7 +142,7 @@ fn end(running: Running) -> String {
 }
 
 fn file_of(view: &Value) -> String {
-    view["last"]["file"].as_str().expect("an episode").to_owned()
+    view["about"]["file"].as_str().expect("an episode").to_owned()
 }
 
 #[test]
@@ -173,14 +173,18 @@ fn the_page_does_what_keys_do() {
     let again = client.request("POST /do", r#"{"do":"start"}"#);
     assert_eq!((again.status, &again.json()["refused"]), (200, &json!(true)));
     client.done(&json!({ "do": "stop" }));
-    let first = file_of(page.until("it has ended", |view| view["last"]["verdict"] == "GOOD"));
+    let first = file_of(page.until("it has ended", |view| view["about"]["verdict"] == "GOOD"));
     assert_eq!(page.view["session"]["verdicts"], json!([1, 0, 0]));
     client.done(&json!({ "do": "label", "episode": first, "label": "success" }));
-    page.until("it is labelled", |view| view["last"]["label"] == "success");
+    page.until("it is labelled", |view| view["about"]["label"] == "success");
 
     // A second one is discarded while it is recorded, by its name; and is taken back.
     client.done(&json!({ "do": "start" }));
     let second = page.until("it records", |view| view["phase"] == "recording")["current"].clone();
+    // It is what is shown, and what a label is about.
+    assert_eq!(page.view["about"]["file"], second);
+    client.done(&json!({ "do": "label", "episode": second, "label": "failure" }));
+    page.until("it is labelled", |view| view["about"]["label"] == "failure");
     client.done(&json!({ "do": "discard", "episode": second }));
     page.until("it is in the trash", |view| view["session"]["discarded"] == 1 && view["phase"] == "idle");
     assert_eq!(file_of(&page.view), first);

@@ -276,7 +276,8 @@ fn never_ran(quality: &Quality, limits: &VerdictSpec, length: f64) -> Option<(Gr
 }
 
 fn clock(quality: &Quality, limits: &VerdictSpec) -> Option<(Grade, String)> {
-    let drift = quality.clock_drift.unwrap_or(0.0) / 1e3;
+    // A clock that is followed does not drift: what grows is the delay, which is judged as late.
+    let drift = quality.clock_drift.filter(|_| quality.clock_uncertainty.is_none()).unwrap_or(0.0) / 1e3;
     let (drifted, ahead) = (drift.abs(), quality.clock_ahead / 1e3);
     let (grade, limit) = longer(limits, |limits| limits.clock, drifted.max(ahead))?;
     let text = if ahead >= drifted {

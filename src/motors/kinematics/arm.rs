@@ -1,12 +1,12 @@
 //! An arm of the registry: what its motors are in the chain, and what its actions mean.
 
-use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use k::SerialChain;
 use k::nalgebra::{DMatrix, DVector, Isometry3, Quaternion, UnitQuaternion};
 use rapid_core::action::NoAction;
 use rapid_registry::{EffectorSpec, MAX_MOTORS, MOTOR_CHANNELS, MotorSpec, TipRotation};
+use rapid_system::limited::read_text;
 
 use super::chain::{Chain, ChainError, isometry};
 
@@ -171,13 +171,11 @@ impl Arm {
 
 /// The text of a description.
 fn read(file: &Path) -> std::io::Result<String> {
-    let mut text = String::new();
-    let file = std::fs::File::open(file)?;
-    if !file.metadata()?.is_file() {
+    // Without opening it: opening a pipe would wait for its writer.
+    if !std::fs::metadata(file)?.is_file() {
         return Err(std::io::Error::other("it is not a file"));
     }
-    file.take(LARGEST_FILE).read_to_string(&mut text)?;
-    Ok(text)
+    read_text(&std::fs::File::open(file)?, LARGEST_FILE)
 }
 
 /// See [`Arm::solver`].

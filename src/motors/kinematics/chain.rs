@@ -1,5 +1,7 @@
 //! The joints between two links of a description, and the pose of the last link.
 
+use std::collections::HashMap;
+
 use k::nalgebra::{Isometry3, Quaternion, Translation3, Unit, UnitQuaternion, Vector3};
 use urdf_rs::{JointType, Robot};
 
@@ -64,8 +66,8 @@ impl Chain {
     /// # Errors
     /// When there is no such chain, or it has a joint that no motor can move.
     pub fn read(urdf: &str, frame: Option<&str>, tip: &str) -> Result<Self, ChainError> {
-        if is_deeper_than(urdf, DEEPEST) {
-            return Err(ChainError::NoDescription(format!("elements are nested more than {DEEPEST} deep")));
+        if let Some(why) = unreadable(urdf) {
+            return Err(ChainError::NoDescription(why));
         }
         let robot = urdf_rs::read_from_string(urdf).map_err(|error| ChainError::NoDescription(error.to_string()))?;
         for link in frame.into_iter().chain([tip]) {
@@ -146,31 +148,65 @@ impl Chain {
     }
 }
 
-/// Whether a text has so many elements within each other. It is no parser: what it takes for elements in comments counts too.
-fn is_deeper_than(text: &str, most: usize) -> bool {
-    let mut depth = 0_usize;
-    for part in text.split('<').skip(1) {
-        match part.as_bytes().first() {
-            Some(b'/') => depth = depth.saturating_sub(1),
-            Some(b'?' | b'!') => {}
-            _ if part.split('>').next().is_some_and(|tag| tag.ends_with('/')) => {}
+/// Why the parser, which calls itself for each element within another, should not get this text; `None` if it may. What two
+/// readers of XML could read differently is refused.
+fn unreadable(text: &str) -> Option<String> {
+    let (mut depth, mut rest) = (0_usize, text);
+    while let Some((_, tag)) = rest.split_once('<') {
+        let Some((inside, behind)) = split_tag(tag) else {
+            return Some("it is not well-formed, or has a document type".to_owned());
+        };
+        rest = behind;
+        match inside.as_bytes() {
+            // A comment, a section of text, an instruction.
+            [b'!' | b'?', ..] | [.., b'/'] => {}
+            [b'/', ..] => depth = depth.saturating_sub(1),
             _ => depth += 1,
         }
-        if depth > most {
-            return true;
+        if depth > DEEPEST {
+            return Some(format!("elements are nested more than {DEEPEST} deep"));
         }
     }
-    false
+    None
+}
+
+/// What is between a `<` and its `>`, and what follows. `None` of what is not whole or could be read in two ways, and of a
+/// document type: its entities would be text that is not here.
+fn split_tag(tag: &str) -> Option<(&str, &str)> {
+    for (begin, end) in [("!--", "-->"), ("![CDATA[", "]]>"), ("?", "?>")] {
+        if let Some(inside) = tag.strip_prefix(begin) {
+            let length = inside.find(end).filter(|_| !inside.starts_with(['-', '>']))?;
+            return tag.split_at_checked(begin.len() + length + end.len());
+        }
+    }
+    let (mut quote, mut before) = (None, b' ');
+    for (at, byte) in tag.bytes().enumerate() {
+        match (byte, quote) {
+            (b'>', None) => return Some((tag.get(..at)?, tag.get(at + 1..)?)),
+            (b'"' | b'\'', None) if before == b'=' => quote = Some(byte),
+            (b'"' | b'\'', None) | (b'<', _) => return None,
+            (b'!', None) if at == 0 => return None,
+            (byte, Some(open)) if byte == open => quote = None,
+            _ => {}
+        }
+        before = if byte.is_ascii_whitespace() { before } else { byte };
+    }
+    None
 }
 
 /// The joints from `frame` to `tip` in order.
 fn path<'a>(robot: &'a Robot, frame: Option<&str>, tip: &str) -> Result<Vec<&'a urdf_rs::Joint>, ChainError> {
     let not_attached =
         || ChainError::NotAttached { frame: frame.unwrap_or("the root").to_owned(), tip: tip.to_owned() };
+    // The first joint of a link, as if they were searched in order.
+    let mut above = HashMap::new();
+    for joint in &robot.joints {
+        above.entry(joint.child.link.as_str()).or_insert(joint);
+    }
     let mut path = Vec::new();
     let mut link = tip;
     while Some(link) != frame {
-        let Some(joint) = robot.joints.iter().find(|joint| joint.child.link == link) else {
+        let Some(joint) = above.get(link).copied() else {
             if frame.is_none() {
                 break;
             }

@@ -303,3 +303,81 @@ fn a_description_that_does_not_fit_is_refused_by_name() {
     assert_eq!(effector.rotation, TipRotation::Held([0.0, 1.0, 0.0, 0.0]));
     assert_eq!(MOTOR_CHANNELS * 6 + effector.numbers(), 44);
 }
+
+/// Beginnings of an element, after each of which the next is within it.
+const OPENED: [&str; 9] = [
+    "<a>",
+    "<a\n >",
+    "<a b='/>'>",
+    "<a b=\"x/>\">",
+    "<a><!--</a>-->",
+    "<a><![CDATA[</a>]]>",
+    "<a><?x </a>?>",
+    "<!-- <b/> --><a>",
+    "<b/><a>",
+];
+
+proptest! {
+    /// The parser would overflow its stack, which ends the process.
+    #[test]
+    fn elements_within_elements_are_refused_however_they_are_written(
+        parts in proptest::collection::vec(0..OPENED.len(), 1..6), depth in prop_oneof![Just(65_usize), Just(60_000)]
+    ) {
+        let opened: String = (0..depth).map(|number| OPENED[parts[number % parts.len()]]).collect();
+        let urdf = URDF.replace("</robot>", &format!("{opened}{}</robot>", "</a>".repeat(depth)));
+        let why = Chain::read(&urdf, None, "tool").unwrap_err().to_string();
+        prop_assert!(why.contains("nested more than 64 deep"), "{}", why);
+    }
+
+    /// Whatever stands for a number of the description, what it accepts is finite.
+    #[test]
+    fn numbers_of_a_description_are_finite_or_refused(
+        at in 0_usize..200, number in prop_oneof![
+            Just("inf"), Just("-inf"), Just("NaN"), Just("1e400"), Just("1e308"), Just("1e3000000"), Just(""), Just("1 2 3 4 5"),
+        ]
+    ) {
+        let numbers: Vec<_> = URDF.match_indices(|c: char| c.is_ascii_digit()).map(|(at, _)| at).collect();
+        let at = numbers[at % numbers.len()];
+        let urdf = [&URDF[..at], number, &URDF[at + 1..]].concat();
+        if let Ok(chain) = Chain::read(&urdf, None, "tool") {
+            let (place, turned) = chain.pose([0.1; 7].into_iter());
+            prop_assert!(place.iter().chain(&turned).all(|number| number.is_finite()), "{}", urdf);
+        }
+    }
+}
+
+#[test]
+fn what_two_readers_of_xml_could_read_differently_is_refused() {
+    for strange in [
+        "<!DOCTYPE robot [<!ENTITY x \"<a>\">]>",
+        "<a b='<c>'/>",
+        "<a '>' />",
+        "</a '>",
+        "<!--><a>-->",
+        "<!---><a>-->",
+        "<?><a>?>",
+        "<!-- endless",
+        "<![CDATA[ endless",
+        "<a b='",
+    ] {
+        let urdf = URDF.replace("</robot>", &format!("{strange}</robot>"));
+        let why = Chain::read(&urdf, None, "tool").unwrap_err().to_string();
+        assert!(why.contains("not well-formed"), "{strange}: {why}");
+    }
+}
+
+#[test]
+fn a_description_of_very_many_joints_is_read_once() {
+    use std::fmt::Write as _;
+    let mut urdf = "<robot name='r'><link name='l0'/>".to_owned();
+    for number in 1..60_000 {
+        let before = number - 1;
+        let _ = write!(
+            urdf,
+            "<link name='l{number}'/><joint name='j{number}' type='fixed'><parent link='l{before}'/><child link='l{number}'/></joint>"
+        );
+    }
+    urdf.push_str("</robot>");
+    let chain = Chain::read(&urdf, None, "l59999").unwrap();
+    assert!(distance(&chain.pose(std::iter::empty()).0, &[0.0; 3]) < 1e-12);
+}

@@ -5,10 +5,11 @@
 //! policy either way.
 
 use std::fs::File;
-use std::io::{self, Read};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use rapid_core::text;
+use rapid_system::limited::{read_bytes, read_text};
 use sha2::{Digest, Sha256};
 
 use super::external::{self, GraphError};
@@ -20,6 +21,8 @@ use super::validate::parse;
 pub const POLICY_FILE: &str = "policy.json";
 /// It is a few kilobytes, provenance included.
 const MAX_POLICY_BYTES: u64 = 4 << 20;
+/// ONNX has no larger file: a message of protobuf ends there.
+const MAX_GRAPH_BYTES: u64 = (2 << 30) - 1;
 
 const POLICY: &str = include_str!("../../../models/tactile-id/policy.json");
 static ENCODER: &[u8] = include_bytes!("../../../models/tactile-id/encoder.onnx");
@@ -129,7 +132,10 @@ impl Bundle {
             bytes.extend_from_slice(if graph == Graph::Encoder { ENCODER } else { DENOISER });
             Ok(bytes.len())
         } else {
-            open(&self.folder.join(&file.file)).and_then(|mut open| open.read_to_end(&mut bytes))
+            open(&self.folder.join(&file.file)).and_then(|open| {
+                bytes = read_bytes(&open, MAX_GRAPH_BYTES)?;
+                Ok(bytes.len())
+            })
         };
         let wrong = match read {
             Err(error) => Some((
@@ -158,12 +164,7 @@ impl Bundle {
 }
 
 fn read_policy(path: &Path) -> io::Result<String> {
-    let mut text = String::new();
-    open(path)?.take(MAX_POLICY_BYTES + 1).read_to_string(&mut text)?;
-    if text.len() as u64 > MAX_POLICY_BYTES {
-        return Err(io::Error::other(format!("it is larger than {} MiB", MAX_POLICY_BYTES >> 20)));
-    }
-    Ok(text)
+    read_text(&open(path)?, MAX_POLICY_BYTES)
 }
 
 /// A regular file, or a link to one: model hubs store bundles as links. Nothing else: opening a pipe would block.

@@ -121,6 +121,8 @@ const LOCK: &str = ".upload.lock";
 const EPISODES: &str = "--max-depth 1 --include=*.mcap";
 /// The files of sessions, of which one may change at any moment.
 const SESSIONS: &str = "--max-depth 1 --include=session*.toml --include=session*.md";
+/// What people noted about episodes, here or in the store: the newer one counts.
+const NOTES: &str = "--max-depth 1 --include=*.mcap.toml --update";
 
 /// The episodes that the list of the shell's variable `listed` names.
 const LISTED: &str = r#"--max-depth 1 --files-from-raw "$$listed""#;
@@ -131,6 +133,7 @@ fn steps() -> String {
     format!(
         r#"listed=$$(mktemp) && equal=$$(mktemp) || exit; failed=; \
   rclone copy "$$EPISODES" "$$STORE" {SESSIONS} --checksum || failed=yes; \
+  rclone copy "$$EPISODES" "$$STORE" {NOTES} || failed=yes; \
   rclone lsf "$$EPISODES" {EPISODES} --files-only >"$$listed" || failed=yes; \
   rclone copy "$$EPISODES" "$$STORE" {LISTED} --checksum --immutable || failed=yes; \
   rclone check "$$EPISODES" "$$STORE" {LISTED} --one-way || failed=yes; \

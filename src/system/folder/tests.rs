@@ -124,11 +124,11 @@ fn only_the_permitted_missing_folders_are_created() {
 }
 
 #[test]
-fn a_planted_file_is_read_up_to_the_limit() {
+fn a_planted_file_is_not_read_beyond_the_limit() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("file");
     fs::write(&path, "0123456789").unwrap();
-    assert_eq!(read_text(&path, 4).unwrap(), "0123");
+    assert!(read_text(&path, 4).unwrap_err().to_string().contains("larger than 4 B"));
     assert_eq!(read_text(&path, 100).unwrap(), "0123456789");
     fs::remove_file(&path).unwrap();
     symlink("/dev/zero", &path).unwrap();

@@ -102,7 +102,7 @@ function show(view, lost) {
   const failed = view.not_started && `not started: ${view.not_started}`;
   set(at("trouble"), [failed, full, ...view.stops, view.policy].filter(Boolean).join("\n"));
   showBits(view.bits, lost);
-  showLast(view.last);
+  showAbout(view.about);
   const line = (one) => `${new Date(one.ms).toLocaleTimeString()} ${one.text}`;
   list(at("warnings"), view.warnings.map(line), (i) => view.warnings[i].level);
 }
@@ -133,15 +133,17 @@ function showBits(bits, lost) {
   });
 }
 
-function showLast(last) {
-  at("last").hidden = !last;
-  if (!last) return;
-  set(at("last-verdict"), last.verdict || "");
-  at("last-verdict").className = last.verdict || "";
-  set(at("last-file"), `${last.file}, ${last.seconds.toFixed(1)}\u00a0s`);
-  list(at("last-reasons"), last.reasons || [], () => last.verdict || "");
-  at("success").classList.toggle("chosen", last.label === "success");
-  at("failure").classList.toggle("chosen", last.label === "failure");
+// The episode that labels and discards are about.
+function showAbout(about) {
+  at("about").hidden = !about;
+  if (!about) return;
+  set(at("about-verdict"), about.verdict || "");
+  at("about-verdict").className = about.verdict || "";
+  const length = typeof about.seconds === "number" ? `${about.seconds.toFixed(1)}\u00a0s` : "being recorded";
+  set(at("about-file"), `${about.file}, ${length}`);
+  list(at("about-reasons"), about.reasons || [], () => about.verdict || "");
+  at("success").classList.toggle("chosen", about.label === "success");
+  at("failure").classList.toggle("chosen", about.label === "failure");
 }
 
 // --- pictures
@@ -189,15 +191,14 @@ function age(bit, picture, lost) {
 
 function buttons(lost) {
   const phase = view ? view.phase : "idle";
-  const last = view && view.last ? view.last.file : "";
+  const subject = view && view.about ? view.about.file : "";
   if (buttons.phase !== phase) { buttons.phase = phase; changed = now(); asked = -Infinity; }
-  if (buttons.last !== last) { buttons.last = last; changed = now(); }
+  if (buttons.about !== subject) { buttons.about = subject; changed = now(); }
   const busy = lost || !view || isWithin(now() - changed, PRESS_AGAIN);
   const isRecording = phase === "recording";
   const waits = phase === "countdown" || phase === "reset";
   set(at("toggle"), isRecording ? "■ End" : waits ? "Start now" : "● Start");
   at("toggle").disabled = busy || phase === "ending";
-  const subject = view && (view.current || (view.last && view.last.file));
   const isSure = isWithin(now() - asked, SURE) && subject === buttons.subject;
   set(at("discard"), isSure ? "Really discard" : view && view.current ? "Discard this" : "Discard last");
   at("discard").classList.toggle("sure", isSure);
@@ -231,7 +232,7 @@ at("toggle").addEventListener("click", () => {
   render();
 });
 at("discard").addEventListener("click", () => {
-  const subject = view.current || view.last.file;
+  const subject = view.about.file;
   if (isWithin(now() - asked, SURE) && subject === buttons.subject) {
     asked = -Infinity;
     request({ do: "discard", episode: subject });
@@ -248,7 +249,7 @@ for (const what of ["mark", "undo"]) {
   });
 }
 for (const label of ["success", "failure"]) {
-  at(label).addEventListener("click", () => request({ do: "label", episode: view.last.file, label }));
+  at(label).addEventListener("click", () => request({ do: "label", episode: view.about.file, label }));
 }
 
 setInterval(watch, 250);

@@ -124,8 +124,14 @@ fn every_check_has_its_text_and_its_two_limits() {
     );
     is(|q| q.clock_drift = Some(150.0), Bad, &["cam: its clock fell behind this machine's by 150 ms (limit 100 ms)"]);
     is(|q| q.clock_ahead = 12.0, Suspect, &["cam: captured up to 12 ms after it was received (limit 10 ms)"]);
-    // Only the clock of a phone or of another computer is judged.
+    // Only how well the clock of a phone or of another computer is known is judged. It is followed, so what drifts is the delay.
     is(|q| q.clock_uncertainty = Some(1e6), Good, &[]);
+    is(|q| (q.clock_uncertainty, q.clock_drift) = (Some(1.0), Some(150.0)), Good, &[]);
+    is(
+        |q| (q.clock_uncertainty, q.clock_drift, q.clock_ahead) = (Some(1.0), Some(150.0), 12.0),
+        Suspect,
+        &["cam: captured up to 12 ms after it was received (limit 10 ms)"],
+    );
     let far = limits().of_another_clock(Duration::from_millis(25));
     let judged = |ms| {
         let quality = Quality { clock_uncertainty: Some(ms), ..good() };
