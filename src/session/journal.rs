@@ -604,6 +604,7 @@ mod tests {
             note: String::new(),
             marks: Vec::new(),
             sensors: None,
+            replay_of: Vec::new(),
             ..entry("20261124_place-block_002.mcap")
         };
         let file = session(vec![entry("20261124_place-block_001.mcap"), bare]);
